@@ -197,7 +197,7 @@ def _check_pair(first: Report, report: Report) -> None:
         one, two = ([getattr(r.records[uid], key, None) for key in _GT] for r in pair)
         if one != two:
             raise UserError(
-                f"{report.path}: {uid} was compared with a different ground truth than in {first.path}"
+                f"{report.path}: {uid} has another ground truth than in {first.path}"
             )
 
 

@@ -10,8 +10,9 @@ IMAGENET_MEAN = (0.485, 0.456, 0.406)
 IMAGENET_STD = (0.229, 0.224, 0.225)
 
 # Grey values of the backgrounds that images are compared on. Black and grey are used besides
-# white because a white haze is invisible on white. Keys of metrics on white are plain; the others
-# end in the background's name. Turntables and sheets are on grey, which shows dark and bright haze.
+# white because white floaters are invisible on white. Keys of metrics on white are plain; the
+# others end in the background's name. Turntables and sheets are on grey, which shows dark and
+# bright floaters.
 WHITE, GREY = 1.0, 0.5
 GROUNDS = {"black": 0.0, "grey": GREY}
 

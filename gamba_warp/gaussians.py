@@ -122,11 +122,13 @@ class Gaussians:
             means=scale * self.means @ rotation.mT + translation,
             quats=quat_multiply(rotation_quat.to(quats), quats),
             scales=scale * self.scales,
-            harmonics=None if self.harmonics is None else turn_harmonics(self.harmonics, rotation),
+            harmonics=None
+            if self.harmonics is None
+            else rotate_harmonics(self.harmonics, rotation),
         )
 
 
-def turn_harmonics(harmonics: Tensor, rotation: Tensor) -> Tensor:
+def rotate_harmonics(harmonics: Tensor, rotation: Tensor) -> Tensor:
     """Rotate spherical-harmonic coefficients: ``Y(R d) c' = Y(d) c`` for all d.
 
     The matrix between them is the least-squares solution at more directions than coefficients, in

@@ -42,7 +42,7 @@ ALIKE = 1.2  # times the least Chamfer distance, below which a rotated shape cou
 def aligned(
     predicted: Points, gt: Points, steps: Sequence[Step]
 ) -> tuple[Similarity, dict[str, float]]:
-    """Compute the motion of the prediction by all steps.
+    """Compute the transform of the prediction by all steps.
 
     Args:
         predicted: points on the prediction.
@@ -50,23 +50,23 @@ def aligned(
         steps: of ``STEPS``.
 
     Returns:
-        The motion; and Open3D's ``fitness`` (fraction of points with a partner) and ``inlier_rmse``
-        of the last ICP.
+        The transform; and Open3D's ``fitness`` (fraction of points with a partner) and
+        ``inlier_rmse`` of the last ICP.
 
     Raises:
         UserError: the prediction is a single point.
     """
     if steps and not np.ptp(predicted.positions, axis=0).any():
         raise UserError("cannot be aligned: the prediction's points coincide")
-    motion, residual = Similarity(np.eye(3), np.zeros(3)), {}
+    transform, residual = Similarity(np.eye(3), np.zeros(3)), {}
     for step in steps:
-        moved = motion.apply(predicted)
+        moved = transform.apply(predicted)
         if step in ("rigid", "icp"):
             found, residual = icp(moved, gt, with_scale=step == "icp")
         else:
             found = _SEARCHES[step](moved, gt)
-        motion = found.of(motion)
-    return motion, residual
+        transform = found.of(transform)
+    return transform, residual
 
 
 def match_boxes(predicted: Points, gt: Points) -> Similarity:
@@ -100,7 +100,7 @@ def icp(predicted: Points, gt: Points, with_scale: bool) -> tuple[Similarity, di
         with_scale: the scale is free.
 
     Returns:
-        The motion, and Open3D's ``fitness`` (fraction of points with a partner) and
+        The transform, and Open3D's ``fitness`` (fraction of points with a partner) and
         ``inlier_rmse``.
     """
     o3d = import_open3d()
@@ -117,8 +117,8 @@ def icp(predicted: Points, gt: Points, with_scale: bool) -> tuple[Similarity, di
         )
         matrix = result.transformation
     scale = float(np.cbrt(np.linalg.det(matrix[:3, :3])))
-    motion = Similarity(matrix[:3, :3] / scale, np.array(matrix[:3, 3]), scale)
-    return motion, {"fitness": result.fitness, "inlier_rmse": result.inlier_rmse}
+    transform = Similarity(matrix[:3, :3] / scale, np.array(matrix[:3, 3]), scale)
+    return transform, {"fitness": result.fitness, "inlier_rmse": result.inlier_rmse}
 
 
 def search_yaw(predicted: Points, gt: Points) -> Similarity:
@@ -134,7 +134,7 @@ def search_yaw(predicted: Points, gt: Points) -> Similarity:
     return Similarity(best, two.center - best @ one.center)
 
 
-def search_turns(predicted: Points, gt: Points) -> Similarity:
+def search_rotations(predicted: Points, gt: Points) -> Similarity:
     """Find the rotation about any axis with the lowest Chamfer distance; see ``STEPS``."""
     turns, moves, chamfer = _candidates(_Cloud.of(predicted), _Cloud.of(gt))
     best = chamfer.argmin()
@@ -145,7 +145,7 @@ _SEARCHES = {
     "box": match_boxes,
     "scale": match_moments,
     "yaw": search_yaw,
-    "turn": search_turns,
+    "turn": search_rotations,
 }
 
 
@@ -245,7 +245,7 @@ def _candidates(
         two: target.
         also: further initial rotations ``[.., 3, 3]``.
     """
-    every = spread_turns(TURNS)
+    every = spread_rotations(TURNS)
     kept = np.empty((0, 3, 3)) if also is None else also
     for turn in every[_chamfer(one, two, every, SCORED).argsort()]:
         if len(kept) == CANDIDATES:
@@ -276,7 +276,7 @@ def _kabsch(points: np.ndarray, targets: np.ndarray) -> tuple[np.ndarray, np.nda
     return turns, middles - turns @ middle
 
 
-def spread_turns(count: int) -> np.ndarray:
+def spread_rotations(count: int) -> np.ndarray:
     """Return evenly spread rotations ``[count, 3, 3]``: super-Fibonacci spirals (Alexa 2022)."""
     from scipy.spatial.transform import Rotation
 

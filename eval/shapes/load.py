@@ -20,7 +20,7 @@ from gamba_warp.surfaces.extract import extract_surface
 
 from .flags import FLAGS, STRICT, clean_mesh
 from .protocol import GeometryProtocol
-from .shape import Mesh, Points, Shape, Similarity, positions_of, sample, unit_motion
+from .shape import Mesh, Points, Shape, Similarity, positions_of, sample, unit_transform
 
 HUGE = 1e18  # squares of larger coordinates overflow float32
 ROUNDED = 1e-3  # tolerance of a catalogue's rotations, which have few digits
@@ -44,7 +44,7 @@ class LoadedShape:
         source: as in the file.
         shape: in the truth's unit frame.
         flags: of the mesh (for Gaussians: of their surface), names from ``flags.FLAGS``.
-        motion: from the file's coordinates into the unit frame.
+        transform: from the file's coordinates into the unit frame.
         axes: of the file: a key of ``TO_Z_UP``, ``UNKNOWN``, or for a ground truth ``DATASET``.
         warnings: of the file for a report, one line each.
     """
@@ -52,7 +52,7 @@ class LoadedShape:
     source: Shape
     shape: Mesh | Points
     flags: list[str]
-    motion: Similarity
+    transform: Similarity
     axes: str
     warnings: list[str]
 
@@ -98,15 +98,15 @@ def load_gt(
         if placement is not None and placement.fits(positions_of(shape)):
             if asked is None or _same_up(placement, turn):
                 matrix, scale = placement.transform, placement.scale
-                motion = Similarity(matrix[:, :3], scale * matrix[:, 3], scale)
-                return _loaded(shape, motion.apply(shape), motion, DATASET, protocol)
+                transform = Similarity(matrix[:, :3], scale * matrix[:, 3], scale)
+                return _loaded(shape, transform.apply(shape), transform, DATASET, protocol)
             warnings = [f"--up {protocol.up} contradicts DATA, {_FOLLOWED}"]
         elif placement is not None and asked is None:
             warnings = [_OTHER_FILES]
         if abs(turn @ turn.T - np.eye(3)).max() > ROUNDED or np.linalg.det(turn) < 0:
             raise UserError("its catalogue's rotation stretches or mirrors, which is invalid")
-        motion = unit_motion(shape, turn)
-        found = _loaded(shape, motion.apply(shape), motion, axes, protocol)
+        transform = unit_transform(shape, turn)
+        found = _loaded(shape, transform.apply(shape), transform, axes, protocol)
         found.warnings[:0] = warnings
         return found
     except UserError as error:
@@ -120,13 +120,13 @@ def _same_up(placement: Placement, turn: np.ndarray) -> bool:
 
 
 def load_prediction(
-    path: Path, motion: Similarity, frame_axes: str, protocol: GeometryProtocol
+    path: Path, transform: Similarity, frame_axes: str, protocol: GeometryProtocol
 ) -> LoadedShape:
     """Read a predicted shape, move it, and turn Gaussians into a surface.
 
     Args:
         path: file.
-        motion: from the frame of the predictions into the truth's unit frame.
+        transform: from the frame of the predictions into the truth's unit frame.
         frame_axes: of that frame, a key of ``TO_Z_UP`` or ``UNKNOWN``.
         protocol: with the file's axes, the options of surfaces, and the refused flags.
 
@@ -139,8 +139,8 @@ def load_prediction(
         axes = of_file
     if axes in ("auto", "frame"):
         axes = frame_axes
-    motion = motion.after(rotation_between(axes, frame_axes))
-    shape = motion.apply(source)
+    transform = transform.after(rotation_between(axes, frame_axes))
+    shape = transform.apply(source)
     reach = float(np.abs(positions_of(shape)).max())
     if not reach <= FAR:
         raise UserError(f"{path}: reaches {reach:.3g} times the truth's longest side")
@@ -151,16 +151,20 @@ def load_prediction(
             else:
                 surface = extract_surface(shape, protocol.surface)
                 shape = Mesh(surface.vertices, surface.faces)
-        return _loaded(source, shape, motion, axes, protocol)
+        return _loaded(source, shape, transform, axes, protocol)
     except UserError as error:
         raise UserError(f"{path}: {error}") from error
 
 
 def _loaded(
-    source: Shape, shape: Mesh | Points, motion: Similarity, axes: str, protocol: GeometryProtocol
+    source: Shape,
+    shape: Mesh | Points,
+    transform: Similarity,
+    axes: str,
+    protocol: GeometryProtocol,
 ) -> LoadedShape:
     if isinstance(shape, Points):
-        return LoadedShape(source, shape, [], motion, axes, [])
+        return LoadedShape(source, shape, [], transform, axes, [])
     mesh, flags = clean_mesh(shape, protocol.strict)
     if isinstance(source, Mesh) and source.flat:
         flags = [flag for flag in FLAGS if flag in (*flags, "degenerate")]
@@ -170,7 +174,7 @@ def _loaded(
     if protocol.strict and isinstance(source, Mesh) and refused:
         raise UserError(f"--strict: {', '.join(refused)}")
     omitted = source.omitted if isinstance(source, Mesh) else ()
-    return LoadedShape(source, mesh, flags, motion, axes, [*omitted])
+    return LoadedShape(source, mesh, flags, transform, axes, [*omitted])
 
 
 def load_shape(path: Path) -> tuple[Shape, str]:

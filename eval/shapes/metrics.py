@@ -62,8 +62,8 @@ def align_shape(
     """Align a prediction by the protocol; arguments as for ``compare``.
 
     Returns:
-        The prediction; ``alignment`` (the motion) if the protocol aligns; and ``gt_symmetry`` (see
-        ``align.symmetry``) if it searches for a rotation.
+        The prediction; ``alignment`` (the transform) if the protocol aligns; and ``gt_symmetry``
+        (see ``align.symmetry``) if it searches for a rotation.
 
     Raises:
         UserError: it cannot be sampled or aligned.
@@ -71,11 +71,11 @@ def align_shape(
     if not protocol.align:
         return predicted, {}
     points, true_points = (take_points(s, protocol, protocol.seed) for s in (predicted, gt))
-    motion, residual = aligned(points, true_points, protocol.align)
-    found: dict[str, Any] = {"alignment": motion.record() | residual}
+    transform, residual = aligned(points, true_points, protocol.align)
+    found: dict[str, Any] = {"alignment": transform.record() | residual}
     if {"yaw", "turn"} & set(protocol.align):
         found["gt_symmetry"] = symmetry(true_points)
-    return motion.apply(predicted), found
+    return transform.apply(predicted), found
 
 
 def point_metrics(
@@ -182,7 +182,7 @@ def chamfer_by_transform(
     points = of.positions
     searched = (AS_IS, f"{MIRRORED} along x")
     for name in searched if "turn" in protocol.align else TRANSFORMS:
-        turned = Points(predicted.motion.after(TRANSFORMS[name]).points(points))
+        turned = Points(predicted.transform.after(TRANSFORMS[name]).points(points))
         turned = aligned(turned, true, protocol.align)[0].apply(turned)
         ways = nearest(turned, true), nearest(true, turned)
         found[name] = float(np.mean([distances.mean() for distances, _ in ways]))

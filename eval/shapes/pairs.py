@@ -299,7 +299,7 @@ def _shapes_in(folder: Path, rendered: Container[str] = ()) -> dict[str, list[Pa
 
 
 def out_of_reference(dataset: ViewDataset, uid: str, reference: int, distance: float) -> Similarity:
-    """Return the motion from the input camera's world, the model's, to the dataset's.
+    """Return the transform from the input camera's world, the model's, to the dataset's.
 
     Args:
         dataset: that the object belongs to.
@@ -318,14 +318,14 @@ def out_of_reference(dataset: ViewDataset, uid: str, reference: int, distance: f
 
 
 def evaluate_pair(
-    pair: Pair, protocol: GeometryProtocol, motion: Similarity | None
+    pair: Pair, protocol: GeometryProtocol, transform: Similarity | None
 ) -> dict[str, Any]:
     """Load and compare one pair.
 
     Args:
         pair: the files.
         protocol: of the comparison.
-        motion: of the prediction into the truth's unit frame; None: the same as the truth's.
+        transform: of the prediction into the truth's unit frame; None: the same as the truth's.
 
     Returns:
         The object's record.
@@ -339,7 +339,7 @@ def evaluate_pair(
     stages = Stopwatch(3)
     with stages("load"):
         gt = load_gt(pair.gt, protocol, pair.rotation, pair.placement)
-        into, frame_axes = motion or gt.motion, FRAME_AXES.get(protocol.frame, gt.axes)
+        into, frame_axes = transform or gt.transform, FRAME_AXES.get(protocol.frame, gt.axes)
         predicted = load_prediction(pair.pred, into, frame_axes, protocol)
     with stages("compare"):
         if note := scale_note(predicted.shape, protocol):
@@ -363,7 +363,7 @@ def evaluate_pair(
         "chamfer_turned": turned,
         "pred_sha256": sha256(pair.pred),
         "gt_sha256": sha256(pair.gt),
-        "gt_normalization": gt.motion.record(),
+        "gt_normalization": gt.transform.record(),
         "seconds": stages.seconds,
     }
 
@@ -432,13 +432,13 @@ def _attempt(
         torch.set_num_threads(threads)
     quiet_warp()  # the child runs nothing else
     try:
-        motion = None
+        transform = None
         if protocol.frame == "unit":
-            motion = Similarity(np.eye(3), np.zeros(3))
+            transform = Similarity(np.eye(3), np.zeros(3))
         elif dataset is not None:
-            motion = out_of_reference(dataset, pair.name, protocol.reference, protocol.distance)
+            transform = out_of_reference(dataset, pair.name, protocol.reference, protocol.distance)
             pair = pair._replace(placement=dataset.files(pair.name).placement)
-        return evaluate(pair, protocol, motion)
+        return evaluate(pair, protocol, transform)
     except UserError as error:
         return failure(pair.name, error)
     except Exception as error:  # of any library; the other pairs continue

@@ -59,7 +59,7 @@ FORMS: dict[ChamferForm, str] = {
 }
 DEFINITIONS = {
     "normalization": "ground truth centred on its bounding box, longest side 1, turned to z-up",
-    "axes": "of a file: asked for, else of a ground truth what the dataset that was rendered of it says, "
+    "axes": "of a file: asked for, else of a ground truth what the dataset rendered of it says, "
     "else those of its format (Gaussians: opencv; .obj, .glb, .gltf: opengl), else unknown; a "
     "prediction is turned into those of its frame where both are known",
     "samples": "both shapes are drawn from with one seed: a shape and itself have distance 0",
@@ -69,7 +69,7 @@ DEFINITIONS = {
     "hausdorff": "largest nearest distance, of either way, between the points",
     "fscore": "harmonic mean of the fractions of predicted and of true points within the threshold",
     "normal_consistency": "mean absolute cosine at nearest points, mean of both ways",
-    "noise_floor": "chamfer between two samples of the ground truth itself, one way; of a point cloud "
+    "noise_floor": "chamfer between two samples of the ground truth, one way; of a point cloud "
     "between two halves that share no point",
 }
 

@@ -133,7 +133,7 @@ def evaluate_variants(
 def vary_pair(
     pair: Pair,
     protocol: GeometryProtocol,
-    motion: Similarity | None,
+    transform: Similarity | None,
     protocols: dict[str, GeometryProtocol],
 ) -> dict[str, Any]:
     """Return the record of one pair: metrics, or the reason of a failure, under each protocol.
@@ -141,7 +141,7 @@ def vary_pair(
     Args:
         pair: the files.
         protocol: the chosen one, which loads the ground truth.
-        motion: of the prediction into the truth's unit frame; None: the same as the truth's.
+        transform: of the prediction into the truth's unit frame; None: the same as the truth's.
         protocols: by label.
 
     Raises:
@@ -165,7 +165,7 @@ def vary_pair(
     found: dict[str, dict[str, Any]] = {}
     for label, chosen in protocols.items():
         try:
-            loaded = once(load_prediction, pair.pred, motion or gt.motion, axes, chosen)
+            loaded = once(load_prediction, pair.pred, transform or gt.transform, axes, chosen)
             moved, _ = once(align_shape, loaded.shape, gt.shape, chosen)
             metrics = once(point_metrics, moved, gt.shape, chosen)
             metrics = metrics | once(shape_iou, moved, gt.shape, chosen)

@@ -1,4 +1,4 @@
-"""Meshes and point clouds, their motions, sampling and nearest points.
+"""Meshes and point clouds, their transforms, sampling and nearest points.
 
 The parent process, which only passes pairs to children, imports this module, so functions import
 torch.
@@ -147,16 +147,16 @@ class Similarity:
         return shape.transformed(rotation, translation, self.scale)
 
     def after(self, turn: np.ndarray) -> Similarity:
-        """Return this motion after a rotation ``[3, 3]`` about the origin."""
+        """Return this transform after a rotation ``[3, 3]`` about the origin."""
         return Similarity(self.rotation @ turn, self.translation, self.scale)
 
     def of(self, first: Similarity) -> Similarity:
-        """Return this motion after another one."""
+        """Return this transform after another one."""
         moved = self.points(first.translation[None])[0]
         return Similarity(self.rotation @ first.rotation, moved, self.scale * first.scale)
 
     def record(self) -> dict:
-        """Return the motion for a report: ``scale, rotation, translation`` as plain numbers."""
+        """Return the transform for a report: ``scale, rotation, translation`` as plain numbers."""
         return {
             "scale": float(self.scale),
             "rotation": self.rotation.tolist(),
@@ -171,8 +171,8 @@ def positions_of(shape: Shape) -> np.ndarray:
     return shape.positions if isinstance(shape, Points) else shape.means.numpy()
 
 
-def unit_motion(shape: Mesh | Points, turn: np.ndarray) -> Similarity:
-    """Return the motion that rotates a shape, centres it, and makes its longest side 1.
+def unit_transform(shape: Mesh | Points, turn: np.ndarray) -> Similarity:
+    """Return the transform that rotates a shape, centres it, and makes its longest side 1.
 
     Args:
         shape: at least two distinct points.

@@ -62,14 +62,14 @@ def _draw_points(points: Any, viewmat: np.ndarray, K: np.ndarray) -> np.ndarray:
 
 
 def _draw_pair(
-    pair: Any, protocol: GeometryProtocol, motion: Similarity | None = None
+    pair: Any, protocol: GeometryProtocol, transform: Similarity | None = None
 ) -> dict[str, Any]:
     """Return a record with the images of a pair, as it was compared; runs in a child."""
     from .load import FRAME_AXES, load_gt, load_prediction
     from .metrics import align_shape
 
     gt = load_gt(pair.gt, protocol, pair.rotation, pair.placement)
-    into, axes = motion or gt.motion, FRAME_AXES.get(protocol.frame, gt.axes)
+    into, axes = transform or gt.transform, FRAME_AXES.get(protocol.frame, gt.axes)
     predicted = load_prediction(pair.pred, into, axes, protocol)
     shapes = align_shape(predicted.shape, gt.shape, protocol)[0], gt.shape
     return {"name": pair.name, "status": OK, "images": np.hstack([*map(image_of, shapes)])}

@@ -72,7 +72,7 @@ def summaries(objects: list[dict[str, Any]]) -> dict[str, Any]:
     return {
         "flags": {s: dict(Counter(f for r in done for f in r[f"{s}_flags"])) for s in sides},
         "axes": {s: dict(Counter(r[f"{s}_axes"] for r in done)) for s in sides},
-        "warnings": [*file_warnings(done), *turn_warnings(done)],
+        "warnings": [*file_warnings(done), *rotation_warnings(done)],
     }
 
 
@@ -85,7 +85,7 @@ def file_warnings(done: list[dict[str, Any]]) -> list[str]:
     return found
 
 
-def turn_warnings(done: list[dict[str, Any]]) -> list[str]:
+def rotation_warnings(done: list[dict[str, Any]]) -> list[str]:
     """Warn about rotations and mirrors of the predictions' files that improve the score a lot.
 
     A transform that improves the mean of many objects gives one warning; else each transform that

@@ -177,7 +177,7 @@ def _match_by_camera(
             distance of the nearest.
     """
     given = LAYOUTS["transforms"][1](folder)
-    lenses = np.stack([_lens(given, i) for i in range(len(given.images))])
+    intrinsics = np.stack([_intrinsics(given, i) for i in range(len(given.images))])
     found, far = {}, {}
     for view in views:
         # The Frobenius norm of R - R' is sqrt(8) sin(angle / 2), accurate for small angles too.
@@ -186,7 +186,7 @@ def _match_by_camera(
         angle = 2 * np.arcsin(np.clip(chord, 0, 1))
         shift = np.linalg.norm(poses[:, :3, 3] - pose[:3, 3], axis=1) / np.linalg.norm(pose[:3, 3])
         # radians; distances of the true camera from the origin; sides of the image
-        off = np.stack([angle, shift, np.abs(lenses - _lens(files, view)).max(1)], 1)
+        off = np.stack([angle, shift, np.abs(intrinsics - _intrinsics(files, view)).max(1)], 1)
         near = np.flatnonzero((off <= CAMERA).all(1))
         if len(near) > 1:
             names = " and ".join(given.images[i].name for i in near[:2])
@@ -197,17 +197,17 @@ def _match_by_camera(
             far[view] = off[off[:, :2].sum(1).argmin()]
     lacking = [view for view in views[1:] if view in far]
     if lacking:
-        turn, move, lens = far[lacking[0]]
+        turn, move, difference = far[lacking[0]]
         raise UserError(
             f"{_missing_message(folder, lacking, views, 'camera')}; the nearest to view "
             f"{lacking[0]} is rotated by {np.degrees(turn):.3g} degrees, "
             f"moved by {move:.3g} of the distance, and "
-            f"its lens differs by {lens:.3g} of the image"
+            f"its intrinsics differ by {difference:.3g} of the image"
         )
     return found, len(given.images)
 
 
-def _lens(files: ObjectFiles, view: int) -> np.ndarray:
+def _intrinsics(files: ObjectFiles, view: int) -> np.ndarray:
     """Return focal lengths and centre in units of the image's sides, ``[4]``."""
     size = np.array(files.sizes[view] or (1, 1), np.float64)
     K = files.Ks[view]

@@ -47,7 +47,7 @@ _LAST_ROW = 0.0, 0.0, 0.0, 1.0  # of a pose
 _LARGEST = 1e9  # of any number in a camera file
 _MAX_TEXT = 500  # letters of a name or of an attribution
 _MAX_DEPTH = 64  # levels of nested folders
-# Lens parameters that may be given per frame.
+# Intrinsics that may be given per frame.
 _DISTORTIONS = {*("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2", "b1", "b2", "sk_x", "sk_y")}
 _DISTORTIONS |= {*("s1", "s2", "s3", "s4", "distortion_params", "rolling_shutter")}
 _DISTORTIONS |= {*("is_fisheye", "equirectangular", "latlong", "orthographic", "is_orthographic")}
@@ -57,8 +57,8 @@ _MODELS = "camera_model", "camera_type"
 _PINHOLES = {*("pinhole", "simple_pinhole", "perspective", "opencv", "full_opencv", "radial")}
 _PINHOLES |= {"simple_radial"}
 _PIXELS = "fl_x", "fl_y", "cx", "cy"
-_LENS = {*("w", "h", "camera_angle_x", "camera_angle_y"), *_PIXELS}
-_LENS |= {*_DISTORTIONS, *_MODELS}
+_INTRINSICS = {*("w", "h", "camera_angle_x", "camera_angle_y"), *_PIXELS}
+_INTRINSICS |= {*_DISTORTIONS, *_MODELS}
 _FIT = 0.02  # tolerance for a simplified mesh, in sides of the cube
 IMAGES = (".webp", ".png", ".jpg", ".jpeg")
 
@@ -277,7 +277,7 @@ def _camera_matrix(focal_x: float, focal_y: float, x: float, y: float) -> np.nda
 
 
 def _check_lens(values: dict, source: str) -> None:
-    """Raise for any lens other than a pinhole, naming the field."""
+    """Raise for any camera model but a pinhole, naming the field."""
     for key in _MODELS:
         model = values.get(key)
         if model is not None and str(model).lower() not in _PINHOLES:
@@ -362,16 +362,16 @@ def _cameras(
     size: Callable[[], tuple[int, int]] | None,
     around_object: bool = True,
 ) -> tuple[np.ndarray, np.ndarray, Sizes]:
-    poses, lenses, names = [], [], [f"{path}: frame {i}" for i in range(len(frames))]
-    shared = None  # most files have one lens for all frames
+    poses, cameras, names = [], [], [f"{path}: frame {i}" for i in range(len(frames))]
+    shared = None  # most files have one camera for all frames
     for frame, source in zip(frames, names):
         poses.append(_matrix(frame["transform_matrix"], source))
-        if lens := {key: frame[key] for key in _LENS & frame.keys()}:
-            lenses.append(_intrinsics({**top, **lens}, source, size))
+        if intrinsics := {key: frame[key] for key in _INTRINSICS & frame.keys()}:
+            cameras.append(_intrinsics({**top, **intrinsics}, source, size))
         else:
             shared = shared or _intrinsics(top, source, size)
-            lenses.append(shared)
-    Ks, sizes = np.stack([K for K, _ in lenses]), [size for _, size in lenses]
+            cameras.append(shared)
+    Ks, sizes = np.stack([K for K, _ in cameras]), [size for _, size in cameras]
     check_cameras(np.stack(poses), Ks, sizes, names, around_object)
     return np.stack(poses), Ks, sizes
 
@@ -554,15 +554,15 @@ def _read_openlrm(folder: Path) -> ObjectFiles:
     _check_count(len(names), folder)
     within = Within(folder)
     images = [within.path(f"rgba/{name}", str(folder)) for name in names]
-    lens = folder / "intrinsics.npy"
-    focal, center, size = read_array(lens, (3, 2))
+    intrinsics = folder / "intrinsics.npy"
+    focal, center, size = read_array(intrinsics, (3, 2))
     values = {"width": float(size[0]), "height": float(size[1])}
-    width, height = (_side(values, key, str(lens)) for key in values)
+    width, height = (_side(values, key, str(intrinsics)) for key in values)
     Ks = np.repeat(_camera_matrix(*focal, *center)[None], len(images), 0)
     paths = [folder / "pose" / f"{image.stem}.npy" for image in images]
     poses = np.stack([_matrix(read_array(path, (3, 4)), str(path)) for path in paths])
     sizes = [(width, height)] * len(images)
-    check_cameras(poses, Ks, sizes, [f"{lens}, pose/{path.name}" for path in paths])
+    check_cameras(poses, Ks, sizes, [f"{intrinsics}, pose/{path.name}" for path in paths])
     poses[:, :3, 3] *= 0.5  # OpenLRM's objects fill a cube of side 2, ours of side 1
     return ObjectFiles(images, poses, Ks, sizes)
 

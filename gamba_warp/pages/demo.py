@@ -155,8 +155,8 @@ def _numbers(results: DemoResults, report: dict[str, Any], card: ModelCard | Non
             "they fill more of their images: an empty image, which is right wherever nothing "
             f"is, has {empty:.1f} dB here and {known['background']:.1f} dB there."
         )
-    haze = "A white haze is invisible on white, but counts here."
-    parts = ("Numbers", text, OF_IMAGES), ("Numbers on black and on grey", haze, OF_GROUNDS)
+    floaters = "White floaters are invisible on white, but count here."
+    parts = ("Numbers", text, OF_IMAGES), ("Numbers on black and on grey", floaters, OF_GROUNDS)
     sections = []
     for title, caption, names in parts:
         rows = [[label, views, *(_cell(m.get(k)) for k in names)] for label, views, m in figures]

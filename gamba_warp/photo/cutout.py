@@ -70,7 +70,7 @@ _MAX_SOFT_FRACTION = (
 _LIKE_GROUND = "it is coloured like the background: parts may be lost, or enclosed background kept"
 
 _PREVIEW_SIDE = 360  # longer side of each image of ``CutOut.beside``
-_HAZE = 0.1  # lower alpha is set to 0
+_FLOATER = 0.1  # lower alpha is set to 0
 _OPAQUE = 0.5  # a warning is given if alpha is lower everywhere
 # An object of a smaller longer side in the reduced image is cut from the whole one.
 _CLOSE = WORKING_SIZE // 2  # pixels
@@ -454,6 +454,6 @@ def fault_of(alpha: np.ndarray) -> str | None:
 
 def _blended(rgb: np.ndarray, alpha: np.ndarray) -> np.ndarray:
     """Return ``[H, W, 4]`` without specks, and without the background along the border."""
-    alpha = np.where(alpha < _HAZE, 0, alpha)  # haze would enlarge the object's bounds
+    alpha = np.where(alpha < _FLOATER, 0, alpha)  # floaters would enlarge the object's bounds
     alpha = without_specks(alpha) if find_spec("skimage") is not None else alpha
     return without_background(rgb, alpha.astype(np.float32))

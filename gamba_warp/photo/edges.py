@@ -2,7 +2,7 @@
 
 A pixel of the edge mixes both: c = alpha · object + (1 - alpha) · background. If the background's
 fraction stays, it is visible as a fringe on any other background, and stretched over the object's
-sides. A mask that is too wide leaves a rim of such pixels, whose alpha is too large.
+sides. A mask that is too wide leaves a boundary of such pixels, whose alpha is too large.
 """
 
 from __future__ import annotations
@@ -18,8 +18,8 @@ _REACH = 2  # pixels between these and solid ones
 _LEAST = 20  # number of these
 _FRINGE = 0.1  # least rms difference of their colours from the solid ones beside them
 _UNEXPLAINED = 0.2  # largest fraction of its square that white or black may leave
-_WIDTH = 128  # a rim is this part of the image's longer side wide, at least two pixels
-# The same two bounds for a rim, and the least excess of its background over what alpha admits.
+_WIDTH = 128  # a boundary is this part of the image's longer side wide, at least two pixels
+# The same two bounds for a boundary, and the least excess of its background over what alpha admits.
 _RIM_FRINGE, _RIM_UNEXPLAINED, _EXCESS = 0.08, 0.3, 0.17
 
 
@@ -28,7 +28,7 @@ def without_matte(rgba: np.ndarray) -> tuple[np.ndarray, str | None]:
 
     Icons and cut-outs often keep the colours that their edge had on white. A soft edge has such a
     colour if it explains the difference to the mean of the solid pixels beside; a hard one has a
-    rim of white, see ``_narrowed``.
+    boundary of white, see ``_narrowed``.
 
     Args:
         rgba: ``[H, W, 4]`` in [0, 1], straight alpha.
@@ -79,7 +79,7 @@ def without_background(rgb: np.ndarray, alpha: np.ndarray) -> np.ndarray:
 def _narrowed(
     rgb: np.ndarray, alpha: np.ndarray, background: np.ndarray | None = None
 ) -> np.ndarray:
-    """Return alpha, less along a rim that has more background than alpha admits.
+    """Return alpha, less along a boundary that has more background than alpha admits.
 
     Each pixel's fraction of the background is its colour's place between those of the object inside
     and of the background.
@@ -87,30 +87,30 @@ def _narrowed(
     Args:
         rgb: ``[H, W, 3]`` in [0, 1].
         alpha: ``[H, W]`` in [0, 1].
-        background: ``[H, W, 3]``; None for the local mean outside the rim.
+        background: ``[H, W, 3]``; None for the local mean outside the boundary.
     """
     width = max(2, max(rgb.shape[:2]) // _WIDTH)
     own = _planes(alpha[..., None])
     solid = (own > 0.5).float()
     near, known = _around(rgb, _eroded(solid, width + 1)[0, 0].numpy(), width + 3)
-    rim = (solid > _eroded(solid, width)) & (known > 0)
+    boundary = (solid > _eroded(solid, width)) & (known > 0)
     if background is None:
         outside = _eroded(1 - solid, width + 1)[0, 0].numpy()
         theirs, known = _around(rgb, outside, width + 3)
-        rim &= known > 0
+        boundary &= known > 0
     else:
         theirs = _planes(background)
     added, full = _planes(rgb) - near, theirs - near
     fraction = (_dot(added, full) / _dot(full, full).clamp(min=1e-3)).clamp(0, 1)
     excess = (fraction - (1 - own)).clamp(min=0)
-    whole, left = (_dot(x, x)[rim].double() for x in (added, added - fraction * full))
+    whole, left = (_dot(x, x)[boundary].double() for x in (added, added - fraction * full))
     is_mixed = (
         len(whole) >= _LEAST
         and whole.mean() > 3 * _RIM_FRINGE**2
         and left.sum() < _RIM_UNEXPLAINED * whole.sum()
-        and excess[rim].mean() > _EXCESS
+        and excess[boundary].mean() > _EXCESS
     )
-    return torch.where(rim, own - excess, own)[0, 0].numpy() if is_mixed else alpha
+    return torch.where(boundary, own - excess, own)[0, 0].numpy() if is_mixed else alpha
 
 
 def _dot(a: Tensor, b: Tensor) -> Tensor:

@@ -25,7 +25,7 @@ _FRINGE = 3  # are wider than twice this, pixels: JPEG makes narrow ones
 _FRACTION = 0.8  # least fraction of border pixels that are background; the object may touch an edge
 _SAMPLES = 20_000  # pixels of a fit
 _FITS = 3
-_RIM = 2  # pixels along the border whose alpha is fractional
+_BOUNDARY = 2  # pixels along the border whose alpha is fractional
 # An enclosed area is background if
 _HOLE = 0.0003  # it has at least this fraction of the image, and
 _LEAST_HOLE = 12  # pixels,
@@ -206,13 +206,13 @@ def _alike(rgb: np.ndarray, residual: np.ndarray, alpha: np.ndarray, exact: np.n
 def _without(rgb: np.ndarray, background: np.ndarray) -> np.ndarray:
     """Return ``[H, W, 4]`` without a background, which keeps its colour on the object's edge."""
     distance, (rows, columns) = ndimage.distance_transform_edt(~background, return_indices=True)
-    rim = ~background & (distance <= _RIM)
+    boundary = ~background & (distance <= _BOUNDARY)
     near = rgb[rows, columns]  # the background's colour beside each pixel
     difference = np.abs(rgb - near).max(-1)
-    # A rim pixel mixes background and object; the largest difference nearby is the object's.
+    # A boundary pixel mixes background and object; the largest difference nearby is the object's.
     full = ndimage.maximum_filter(np.where(background, 0.0, difference), 5)
     fraction = np.clip(difference / np.maximum(full, 1e-6), 0.0, 1.0)
-    alpha = without_specks(np.where(background, 0.0, np.where(rim, fraction, 1.0)))
+    alpha = without_specks(np.where(background, 0.0, np.where(boundary, fraction, 1.0)))
     weight = np.maximum(alpha, 1e-3)[..., None]
     inside = np.clip((rgb - (1 - weight) * near) / weight, 0.0, 1.0)
     return np.dstack([inside, alpha]).astype(np.float32)

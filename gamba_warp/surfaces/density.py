@@ -11,7 +11,7 @@ import torch
 from ..errors import UserError
 from ..gaussians import Gaussians
 
-HAZE = 0.05  # opacity that separates inside from outside when cavities are filled
+FAINT = 0.05  # opacity that separates inside from outside when cavities are filled
 EDGE = 1.1  # largest coordinate of the grid; surfaces are closed there
 LEAST = 0.005  # lower alpha is ignored
 MOST_POINTS = 1 << 27  # largest grid: half a gigabyte, five times that during filling
@@ -48,13 +48,13 @@ def level_set(gaussians: Gaussians, voxels: int, level: float) -> tuple[np.ndarr
 def _cavities(volume: np.ndarray) -> np.ndarray:
     """Return the voxels inside a shell, bool; the first voxel counts as outside.
 
-    A shell of splats has holes at the level of the surface. So the inside is found at a faint haze,
-    where the shell is closed, and grown to the ridge of the shell.
+    A shell of splats has holes at the level of the surface. So the inside is found at a low
+    density, where the shell is closed, and grown to the ridge of the shell.
     """
     from skimage.measure import label
     from skimage.segmentation import watershed
 
-    parts = cast(np.ndarray, label(volume < HAZE, connectivity=1))
+    parts = cast(np.ndarray, label(volume < FAINT, connectivity=1))
     if parts.max(initial=0) < 2:
         return np.zeros(volume.shape, bool)
     seeds = np.where(parts == parts[0, 0, 0], 1, np.where(parts > 0, 2, 0))

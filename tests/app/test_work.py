@@ -74,7 +74,7 @@ def test_a_image_from_above_stands_upright(tmp_path, made):
 
 
 def stroke(shape, box, color):
-    """A layer with one painted box (top, left, bottom, right, as fractions), as the brush paints."""
+    """A layer with one painted box: top, left, bottom, right as fractions."""
     layer = np.zeros((*shape, 4), np.uint8)
     top, left, bottom, right = (round(s * shape[i % 2]) for i, s in enumerate(box))
     value = [int(color[i : i + 2], 16) for i in (1, 3, 5)]

@@ -10,7 +10,7 @@ from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from gamba_warp.eval.shapes import align
-from gamba_warp.eval.shapes.align import STEPS, aligned, spread_turns, symmetry
+from gamba_warp.eval.shapes.align import STEPS, aligned, spread_rotations, symmetry
 from gamba_warp.eval.shapes.metrics import align_shape, compare
 from gamba_warp.eval.shapes.protocol import PRESETS
 from gamba_warp.eval.shapes.shape import Mesh, Points, Similarity, sample
@@ -41,7 +41,7 @@ SHAPES = {
 }
 
 
-def motions(count):
+def transforms(count):
     """Return rotations of any angle, translations of several lengths, and scales from 1/5 to 5."""
     random = np.random.default_rng(7)
     turns = Rotation.random(count, rng=8).as_matrix()
@@ -52,15 +52,15 @@ def motions(count):
 @pytest.mark.parametrize("name", ["chair", "box", "cube"])
 def test_a_copy_comes_back_from_any_start(name):
     protocol = replace(PRESETS["triposr"], align=("scale", "turn", "icp"))
-    for motion in motions(3):
-        moved, got = align_shape(motion.apply(SHAPES[name]), SHAPES[name], protocol)
+    for transform in transforms(3):
+        moved, got = align_shape(transform.apply(SHAPES[name]), SHAPES[name], protocol)
         found = got["alignment"]
         got = compare(moved, SHAPES[name], replace(protocol, align=()))
         assert got["chamfer"] <= 1e-3 and set(got["fscore"].values()) == {1.0}
-        assert abs(found["scale"] * motion.scale - 1) < 1e-3
+        assert abs(found["scale"] * transform.scale - 1) < 1e-3
         assert found["fitness"] > 0.99 and found["inlier_rmse"] < 0.03
         again = Similarity(*(np.array(found[k]) for k in ("rotation", "translation", "scale")))
-        back = again.apply(motion.apply(SHAPES[name]))
+        back = again.apply(transform.apply(SHAPES[name]))
         assert np.abs(back.vertices - moved.vertices).max() < 1e-9
 
 
@@ -136,7 +136,7 @@ def test_a_fitted_turn_is_no_mirror():
 
 
 def test_turns_are_spread_evenly():
-    turns = spread_turns(512)
+    turns = spread_rotations(512)
     assert np.allclose(turns @ turns.transpose(0, 2, 1), np.eye(3))
     assert np.allclose(np.linalg.det(turns), 1)
     some = Rotation.random(200, rng=0).as_matrix()

@@ -112,13 +112,13 @@ def test_nearest_points_are_those_of_every_pair(size, far):
 
 def test_similarity_moves_all_kinds_alike():
     turn = np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])
-    motion = Similarity(turn, np.array([0.1, 0.2, 0.3]), 2.0)
+    transform = Similarity(turn, np.array([0.1, 0.2, 0.3]), 2.0)
     one = shell(0.4, count=9)
-    moved = motion.apply(one)
-    want = motion.points(one.means.double().numpy())
+    moved = transform.apply(one)
+    want = transform.points(one.means.double().numpy())
     assert np.abs(moved.means.numpy() - want).max() < 1e-6
     assert torch.allclose(moved.scales, 2 * one.scales)
-    mesh = motion.apply(cube())
+    mesh = transform.apply(cube())
     assert np.allclose(mesh.vertices, 2 * cube().vertices @ turn.T + [0.1, 0.2, 0.3])
 
 
@@ -127,7 +127,7 @@ def test_truth_is_normalised_and_turned(tmp_path):
     gt = load_gt(tmp_path / "a.obj", protocol())  # y-up by its suffix
     mesh = gt.shape
     assert np.allclose(np.ptp(mesh.vertices, axis=0), [0.5, 0.25, 1.0])
-    again = gt.motion.apply(load_shape(tmp_path / "a.obj")[0])
+    again = gt.transform.apply(load_shape(tmp_path / "a.obj")[0])
     assert np.allclose(np.unique(again.vertices, axis=0), mesh.vertices)
 
 

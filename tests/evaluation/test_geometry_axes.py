@@ -10,7 +10,7 @@ import trimesh
 from helpers.views import cloud_of
 
 from gamba_warp.cli import run
-from gamba_warp.eval.shapes.table import turn_warnings
+from gamba_warp.eval.shapes.table import rotation_warnings
 from gamba_warp.formats.ply import save_ply
 from gamba_warp.surfaces.extract import Surface
 from gamba_warp.surfaces.files import save_mesh
@@ -179,9 +179,9 @@ def test_one_turn_of_many_is_one_warning():
         }
         return {"name": "a", "chamfer_turned": values}
 
-    (said,) = turn_warnings([record(0.06, 0.045)] * 4 + [record(0.05, 0.05)])
+    (said,) = rotation_warnings([record(0.06, 0.045)] * 4 + [record(0.05, 0.05)])
     assert "of 5 predictions would be 0.046 in place of 0.058 if all were turned by 180" in said
-    assert turn_warnings([record(0.06, 0.045)] * 4) == []
-    assert turn_warnings([record(0.06, 0.058)] * 9) == []
-    (said,) = turn_warnings([record(0.05, 0.06)] * 9 + [record(0.06, 0.03)])
+    assert rotation_warnings([record(0.06, 0.045)] * 4) == []
+    assert rotation_warnings([record(0.06, 0.058)] * 9) == []
+    (said,) = rotation_warnings([record(0.05, 0.06)] * 9 + [record(0.06, 0.03)])
     assert said.startswith("1 of 10 predictions") and "a 0.03 in place of 0.06" in said

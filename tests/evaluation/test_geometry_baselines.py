@@ -81,14 +81,14 @@ def evaluate_views(world, *options):
 
 
 def test_the_placed_mesh_is_the_truth(world, capsys):
-    """Through both commands: the retrieval finds the turned twin, whose mesh is the ground truth."""
+    """Through both commands: the retrieval finds the rotated twin, whose mesh is the truth."""
     code, report = evaluate_views(world, "--save-retrieval", str(world / "meshes"))
     assert code == 0
     found = report["objects"][0]["retrieval"]
     assert found["uid"] == "seen" and found["view"] in (1, 2) and found["distance"] < 0.02
     placed = load_mesh(world / "out" / "retrieval" / "twin.ply")
-    motion = out_of_reference(open_dataset(world / "data"), "twin", 0, 1.5)
-    here = motion.points(placed.vertices)
+    transform = out_of_reference(open_dataset(world / "data"), "twin", 0, 1.5)
+    here = transform.points(placed.vertices)
     want = stairs().vertices
     apart = np.linalg.norm(here[:, None] - want[None], axis=-1).min(1)
     assert apart.max() < 1e-5  # float32 in the .ply and in the poses

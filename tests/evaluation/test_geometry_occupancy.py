@@ -52,7 +52,7 @@ def known_shapes() -> dict[str, Mesh]:
 
 
 def with_hole(mesh: Mesh, fraction: float, seed: int) -> Mesh:
-    """Cut out the faces nearest to a random point of the surface, up to ``fraction`` of the area."""
+    """Cut out the faces nearest to a random point, up to ``fraction`` of the area."""
     area = np.linalg.norm(mesh.normals(), axis=1)
     middle = mesh.corners().mean(1)
     at = np.random.default_rng(seed).choice(len(middle), p=area / area.sum())

@@ -164,7 +164,7 @@ def turned_cameras(folder):
     (folder / "transforms.json").write_text(poses(names, AZIMUTHS + 3))
 
 
-def other_lens(folder):
+def other_intrinsics(folder):
     names = [f"view{v}.png" for v in range(VIEWS)]
     text = poses(names, AZIMUTHS).replace('"fl_x": ', '"fl_x": 1')
     (folder / "transforms.json").write_text(text)
@@ -188,7 +188,7 @@ def two_at_one_camera(folder):
         (shrink, "is 12x12, the images compared are 24x24"),
         (on_black, "background rgb(0, 0, 0)"),
         (turned_cameras, "rotated by 3 degrees"),
-        (other_lens, "its lens differs by"),
+        (other_intrinsics, "its intrinsics differ by"),
         (two_at_one_camera, "view2.png and view3.png both have the camera of view 2"),
         (lambda x: (x / "view1.png").write_bytes(b""), "view1.png: the file is empty"),
         (shutil.rmtree, "no such folder"),

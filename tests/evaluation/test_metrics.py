@@ -117,7 +117,7 @@ def test_interval_of_few_objects():
     assert intervals_of(many) == intervals_of(many) != intervals_of(many, seed=1)
 
 
-# On black and on grey beside white: haze that white hides is seen.
+# On black and on grey beside white: floaters that white hides are seen.
 
 SIZE, VIEWS = 32, 3
 
@@ -127,7 +127,7 @@ def cameras():
 
 
 def balls(*colors):
-    """Balls about the origin, each larger than the one before; all but the first are haze."""
+    """Balls about the origin, each larger than the one before; all but the first are floaters."""
     scales = 0.08 * torch.arange(1, len(colors) + 1)[:, None].expand(-1, 3)
     opacities = torch.tensor([0.95] + [0.2] * (len(colors) - 1))
     return Gaussians(torch.zeros(len(colors), 3), None, scales, opacities, torch.tensor(colors))

@@ -49,7 +49,7 @@ def assert_as_alone(pair, protocols, found):
     """Each row is what a direct evaluation by its protocol gives."""
     gt = load_gt(pair.gt, SMALL)
     for label, protocol in protocols.items():
-        shape = load_prediction(pair.pred, gt.motion, gt.axes, protocol).shape
+        shape = load_prediction(pair.pred, gt.transform, gt.axes, protocol).shape
         want, got = compare(shape, gt.shape, protocol), found[label]
         for key in ("chamfer", "iou", "noise_floor", "normal_consistency"):
             assert got[key] == want[key], (label, key)

@@ -362,7 +362,7 @@ def test_other_decoders_and_other_numbers_are_refused(tmp_path, capsys):
 
 
 def test_no_background_gets_into_the_colours():
-    """A plain object keeps its colour at its rim: the correction adds no white."""
+    """A plain object keeps its colour at its boundary: the correction adds no white."""
     model, color = fresh(), torch.tensor([0.5, 0.3, 0.1])
     found = reconstruct(model, box(96, 29, 67, color.tolist()), detail=4)
     front = found.colors[found.opacities > 0.05]

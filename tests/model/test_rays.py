@@ -173,7 +173,7 @@ def test_wild_sizes_and_almost_empty_cells_have_limits():
 
 
 def disc(size: int = 48) -> tuple[torch.Tensor, Cameras]:
-    """Coloured disc with a soft rim, as a flat image seen by five cameras around it."""
+    """Coloured disc with a soft boundary, as a flat image seen by five cameras around it."""
     x = torch.linspace(-1, 1, size)
     radius = (x[:, None] ** 2 + x**2).sqrt()
     alpha = ((0.7 - radius) * size / 2 + 0.5).clamp(0, 1)
@@ -193,7 +193,7 @@ def test_at_the_start_the_image_is_the_billboard():
         made = Gamba(config)(rgba[None], cameras[[0]])
     shown = render(made, Cameras(cameras.viewmats[None], cameras.Ks[None], 48, 48), torch.ones(3))
     rgb = shown.rgb[0].clamp(0, 1)
-    # The smallest Gaussian blurs the rim, which is a tenth of this small disc.
+    # The smallest Gaussian blurs the boundary, which is a tenth of this small disc.
     assert psnr(rgb, flat).min() > 27 and ssim(rgb, flat).min() > 0.94
     assert mask_iou(shown.alpha[0, ..., 0] > 0.5, alpha > 0.5).min() > 0.93
 

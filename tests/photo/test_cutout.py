@@ -202,7 +202,7 @@ def test_sam_comes_before_the_matte(network, busy, monkeypatch):
     square[40:100, 60:140] = 1
     monkeypatch.setattr(cutout, "SamSegmenter", lambda *_: lambda rgb: square)
     found = cut_out(path, options)
-    assert found.method == "sam" and iou(found.mask, square) > 0.95  # less a rim of background
+    assert found.method == "sam" and iou(found.mask, square) > 0.95  # less a boundary of background
     square[:] = 0
     assert cut_out(path, options).method == "matte"
 
@@ -279,9 +279,9 @@ def test_no_fringe_of_the_background_is_left():
     red, green = np.array([0.9, 0.1, 0.1]), np.array([0.0, 0.9, 0.2])
     rgb = (soft[..., None] * red + (1 - soft[..., None]) * green).astype(np.float32)
     clean = cutout._blended(rgb, soft)
-    rim = (soft > 0.1) & (soft < 0.9)
-    assert rim.sum() > 30 and np.abs(rgb[rim] - red).max() > 0.5
-    assert np.abs(clean[rim][:, :3] - red).max() < 0.12  # what blurs cannot tell apart
+    boundary = (soft > 0.1) & (soft < 0.9)
+    assert boundary.sum() > 30 and np.abs(rgb[boundary] - red).max() > 0.5
+    assert np.abs(clean[boundary][:, :3] - red).max() < 0.12  # what blurs cannot tell apart
     np.testing.assert_array_equal(clean[soft == 1][:, :3], rgb[soft == 1])
 
 

@@ -41,7 +41,9 @@ def test_white_and_black_go(name, background, color):
         disc((0.3, 0.4, 0.5)),  # clean
         disc((0.97, 0.97, 0.97)),  # white itself
         mixed(disc((0.95, 0.95, 0.95)), 1.0),  # a fringe that nobody sees
-        mixed(disc((0.2, 0.3, 0.4)), np.array([0.75, 0.6, 0.3])),  # light on a rim, or a photograph
+        mixed(
+            disc((0.2, 0.3, 0.4)), np.array([0.75, 0.6, 0.3])
+        ),  # light on a boundary, or a photograph
         np.dstack([disc((0.5, 0.1, 0.1))[..., :3], np.full(SIZE, 0.5)]).astype(np.float32),
     ],
     ids=["clean", "white", "unseen", "coloured", "half transparent"],
@@ -81,7 +83,7 @@ def test_a_photograph_keeps_the_colours_of_solid_pixels():
 GROUND = np.array([0.2, 0.5, 0.9])
 
 
-def rimmed(color, background, width=1.2):
+def bounded(color, background, width=1.2):
     """A disc before a background as a hard mask of some pixels more cuts it; and as it is."""
     clean = disc(color)
     y, x = np.mgrid[: SIZE[0], : SIZE[1]]
@@ -91,7 +93,7 @@ def rimmed(color, background, width=1.2):
 
 @pytest.mark.parametrize("color", [(0.7, 0.0, 0.1), (0.3, 0.5, 0.3)])
 def test_a_rim_of_white_goes(color):
-    given, clean = rimmed(color, 1.0)
+    given, clean = bounded(color, 1.0)
     found, which = without_matte(given)
     assert which == "white"
     assert (
@@ -102,7 +104,7 @@ def test_a_rim_of_white_goes(color):
 
 
 def test_a_rim_of_a_photographs_background_goes():
-    given, clean = rimmed((0.7, 0.3, 0.1), GROUND)
+    given, clean = bounded((0.7, 0.3, 0.1), GROUND)
     found = without_background(given[..., :3], given[..., 3])
     assert (
         abs(found[..., 3] - clean[..., 3]).mean() < 0.15 * abs(given[..., 3] - clean[..., 3]).mean()
@@ -112,7 +114,7 @@ def test_a_rim_of_a_photographs_background_goes():
 
 
 def test_a_rim_that_is_removed_is_said(tmp_path):
-    given, clean = rimmed((0.7, 0.3, 0.1), GROUND)
+    given, clean = bounded((0.7, 0.3, 0.1), GROUND)
     save_image(tmp_path / "photo.png", given[..., :3])
     for mask, said in ((given, ", without the background mixed into its edge."), (clean, ".")):
         save_image(tmp_path / "mask.png", mask[..., 3])
@@ -130,7 +132,7 @@ def shaded(color):
 
 def outlined(color):
     """A disc in a drawing, with an outline of two pixels."""
-    image, _ = rimmed((0.7, 0.6, 0.2), np.array(color))
+    image, _ = bounded((0.7, 0.6, 0.2), np.array(color))
     return image
 
 

@@ -58,7 +58,7 @@ def test_only_a_small_grey_shadow_at_the_foot_is_removed(darkness, blur, rows, c
     rgb = (0.9 * (1 - np.array(darkness) * cast)).astype(np.float32)
     rgb[50:150, 60:140] = 0.2, 0.3, 0.7
     alpha = plain_matte(rgb).rgba[..., 3]
-    alpha[50:152, 58:142] = 0  # the object and its rim
+    alpha[50:152, 58:142] = 0  # the object and its boundary
     assert alpha.any() != removed
 
 

@@ -155,7 +155,7 @@ def test_surfaces_of_a_sample_are_in_the_models_world(boxes):
     for change, want in ((None, true), (Change(mirror=True), true.flip(-1))):
         batch = load_sample(data, 0, [2, 0], 16, config, background, change, surfaces=True)
         assert batch.surfaces.shape == (1, 2, 16, 16)
-        assert ((batch.surfaces[0] - want).abs() < 2e-3).float().mean() > 0.98  # but for rims
+        assert ((batch.surfaces[0] - want).abs() < 2e-3).float().mean() > 0.98  # but for boundaries
     assert load_sample(data, 0, [2, 0], 16, config, background).surfaces is None
 
 

@@ -195,7 +195,7 @@ def translucency(alpha: Tensor) -> Tensor:
 
 
 def excess_translucency(alpha: Tensor, target: Tensor, cameras: Cameras) -> Tensor:
-    """Average the translucency beyond the true one, whose rims are half transparent too.
+    """Average the translucency beyond the true one, whose boundaries are half transparent too.
 
     Args:
         alpha: ``[B, V, H, W, 1]``, rendered; the input view first.

@@ -89,8 +89,10 @@ def _sample(dataset: ViewDataset, size: int | None, uid: str) -> dict[str, Any] 
         found, frames = dataset.files(uid), list[dict[str, Any]]()
         for view, pose in enumerate(found.camera_to_world):
             (pixels,), (K,) = dataset.images(uid, [view], size)
-            lens = dict(zip(("fl_x", "fl_y", "cx", "cy"), K[[0, 1, 0, 1], [0, 1, 2, 2]].tolist()))
-            frame = lens | {"w": pixels.shape[1], "h": pixels.shape[0]}
+            intrinsics = dict(
+                zip(("fl_x", "fl_y", "cx", "cy"), K[[0, 1, 0, 1], [0, 1, 2, 2]].tolist())
+            )
+            frame = intrinsics | {"w": pixels.shape[1], "h": pixels.shape[0]}
             kinds = {"depth_file": found.depths, "back_file": found.backs}
             if size is None:
                 kinds |= {"file": found.images, "mask": found.masks}
