@@ -196,9 +196,7 @@ def _check_pair(first: Report, report: Report) -> None:
     for uid in sorted(report.records.keys() & first.records.keys()):
         one, two = ([getattr(r.records[uid], key, None) for key in _GT] for r in pair)
         if one != two:
-            raise UserError(
-                f"{report.path}: {uid} has another ground truth than in {first.path}"
-            )
+            raise UserError(f"{report.path}: {uid} has another ground truth than in {first.path}")
 
 
 def _shown(value: Any) -> str:

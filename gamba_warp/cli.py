@@ -25,7 +25,7 @@ from .batch import STAGES
 from .devices import keep_memory, quiet_warp, share_cores, use_fastest_products
 from .errors import FileWarning, PrintableStream, UserError
 from .files import DISK_ERRORS
-from .versions import MADE, SHAPES, __version__, advice, require
+from .versions import PROCEDURAL, SHAPES, __version__, advice, require
 
 
 class Command(NamedTuple):
@@ -64,7 +64,7 @@ COMMANDS = {
     "reconstruct": Command("Images to 3D Gaussians.", "photo", (), _IMAGES),
     "train": Command("Train a model on posed views.", "train", _METRICS, _MODEL, _TRAIN),
     "data furniture": Command("Get 820 models.", "", (), (), _DATA),
-    "data made": Command("Make models of random parts.", "mesh", MADE, (), _DATA),
+    "data procedural": Command("Make models of random parts.", "mesh", PROCEDURAL, (), _DATA),
     "data render": Command("Meshes to posed views.", "mesh", _RENDERS, (), _DATA),
     "data pack": Command("Posed views to shards.", "shards", ("webdataset",), (), _DATA),
     "data index": Command("Check a dataset once, for all later starts.", "", (), (), _DATA),
@@ -202,7 +202,14 @@ _CONFIG = (tyro.conf.DisallowNone, tyro.conf.HelptextFromCommentsOff)
 _NO_DEFAULT = re.compile(r"\s*\(default:\s*(None)?\)")
 _KINDS = {"INT": "a whole number", "FLOAT": "a number"}
 # Earlier names of options.
-RENAMED = {"--frame": "--axes", "--mesh-frame": "--mesh-axes", "--no-lpips": "--lpips off"}
+RENAMED = {
+    "--frame": "--axes",
+    "--mesh-frame": "--mesh-axes",
+    "--no-lpips": "--lpips off",
+    "--made": "--procedural",
+    "--save-pictures": "--save-images",
+    "--resize-pictures": "--resize-images",
+}
 
 
 def help_text(name: str, command: Callable, arguments: list[str]) -> str:

@@ -55,9 +55,9 @@ EXTRA_OF = {
     "webdataset": "shards",
     "xatlas": "mesh",
 }
-# Libraries of the evaluation of shapes, and of the made objects.
+# Libraries of the evaluation of shapes, and of the procedural objects.
 SHAPES = ("kornia", "manifold3d", "open3d", "pymeshlab", "scipy", "skimage", "trimesh")
-MADE = ("trimesh", "manifold3d")
+PROCEDURAL = ("trimesh", "manifold3d")
 HOLDS = {
     "photo": {"kornia", "onnxruntime", "pillow_heif", "pooch", "skimage"},
     "train": {"kornia", "tensorboard", "timm"},

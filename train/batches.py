@@ -261,7 +261,7 @@ class Batches:
         self.world, self.novel, self.last = world, novel, last
         self.failures: dict[str, str] = {}
         self.waited = 0.0
-        self._made: Pool | None = None  # started with the first batch
+        self._procedural: Pool | None = None  # started with the first batch
         self._stream: Iterator[dict[str, Any] | Unreachable] | None = None  # begins with a batch
         self._reading = Lock()
         self._copies: torch.cuda.Stream | None = None
@@ -298,8 +298,8 @@ class Batches:
 
     def close(self) -> None:
         """Cancel the waiting samples; each thread finishes its current one."""
-        if self._made is not None:
-            self._made.close()
+        if self._procedural is not None:
+            self._procedural.close()
         self._pool.shutdown(cancel_futures=True)
 
     def prepare(self, number: int, novel: int) -> Prepared:
@@ -327,10 +327,10 @@ class Batches:
             about = (views.size, self.model, background, change, surfaces)
             return load_sample(dataset, index, chosen, *about)
 
-        made = self._made_sample(number)
+        made = self._procedural_sample(number)
         if made is not None:
-            assert self._made is not None
-            return Prepared(loaded(self._made.take(made), 0), [])
+            assert self._procedural is not None
+            return Prepared(loaded(self._procedural.take(made), 0), [])
         failed: list[tuple[str, str]] = []
         for attempt in range(_TRIES):
             dataset, index = self.data.train, 0
@@ -348,22 +348,22 @@ class Batches:
                 failed.append((dataset.uids[index], first_line(error)))
         return Prepared(None, failed)
 
-    def _made_sample(self, number: int) -> int | None:
-        """Number among the made samples of this process; None if the sample is of a dataset."""
-        share, size = self.config.views.made, self.config.views.batch_size
+    def _procedural_sample(self, number: int) -> int | None:
+        """Number among this process's procedural samples; None if the sample is of a dataset."""
+        share, size = self.config.views.procedural, self.config.views.batch_size
         batch, position = number // size // self.world.size, number % size
         local = batch * size + position  # among the samples of this process
         before, after = math.floor(local * share), math.floor((local + 1) * share)
         return before if after > before else None
 
     def _begin(self, number: int) -> None:
-        """Start made objects and the stream of shards at the ``number``-th batch, once."""
+        """Start procedural objects and the stream of shards at the ``number``-th batch, once."""
         views, world = self.config.views, self.world
         if self.data.shards is not None and self._stream is None:
             # A resumed run begins with another order.
             order = np.random.SeedSequence([self.config.run.seed, 4, number])
             self._stream = self.data.shards.stream(int(order.generate_state(1)[0]))
-        if not views.made or self._made is not None:
+        if not views.procedural or self._procedural is not None:
             return
         images = Settings(
             views=MADE_VIEWS,
@@ -381,7 +381,7 @@ class Batches:
             world=world.size,
             views=images,
         )
-        self._made = Pool(options, math.floor(number * views.batch_size * views.made))
+        self._procedural = Pool(options, math.floor(number * views.batch_size * views.procedural))
 
     def _object(self, place: int) -> int:
         """Return the object of a place in the order; each epoch has its own permutation."""

@@ -386,12 +386,15 @@ def read_run(checkpoint: Path, setup: Setup) -> tuple[Stored, LengthConfig]:
     """
     source = str(checkpoint / "state.pt")
     stored = check_state(read_state(checkpoint), source)
+    views = stored.config.get("views")
+    if isinstance(views, dict) and "made" in views:  # the option's name in older checkpoints
+        views["procedural"] = views.pop("made")
     try:
         plan = msgspec.convert(stored.config, _Plan, dec_hook=lambda kind, value: kind(value))
     except (ValueError, TypeError) as error:
         raise UserError(f"{source}: damaged, {first_line(error)}") from error
     config, processes = setup.config, setup.world.size
-    ignored = () if config.views.made else STEP_SIZE
+    ignored = () if config.views.procedural else STEP_SIZE
     differing = config_differences(stored.config, config.to_dict(), ignored=ignored)
     if stored.objects != setup.data.fingerprint:
         names = f"{stored.objects[:80]} there, {setup.data.fingerprint} here"
@@ -399,7 +402,7 @@ def read_run(checkpoint: Path, setup: Setup) -> tuple[Stored, LengthConfig]:
     elif stored.content not in ("", setup.data.content):
         names = f"{stored.content[:80]} there, {setup.data.content} here"
         differing.append(f"images and cameras of these objects ({names})")
-    if config.views.made and stored.world_size != processes:
+    if config.views.procedural and stored.world_size != processes:
         differing.append(f"world_size ({stored.world_size} there, {processes} here)")
     there = plan.views.batch_size * plan.views.accumulate * stored.world_size
     here = setup.step_size

@@ -65,8 +65,9 @@ class DataConfig:
             samples take any view.
         mirror: Share of the samples whose object is mirrored, with its cameras.
         recolor: Share of the samples whose colour channels are permuted and change gamma.
-        made: Share of the samples that show made objects (gamba data made), which other processes
-            make and render during the training; the others are of the datasets.
+        procedural: Fraction of the samples that show procedural objects (gamba data procedural),
+            which other processes make and render during the training; the others are of the
+            datasets.
         cache: Keep decoded images in memory, with 8 bits a channel. Depth images are read when
             they are used.
         workers: Threads that decode images ahead of the training; also the largest number of
@@ -83,7 +84,7 @@ class DataConfig:
     front_share: Annotated[float, Meta(ge=0, le=1)] = 0.0
     mirror: Annotated[float, Meta(ge=0, le=1)] = 0.0
     recolor: Annotated[float, Meta(ge=0, le=1)] = 0.0
-    made: Annotated[float, Meta(ge=0, le=1)] = 0.0
+    procedural: Annotated[float, Meta(ge=0, le=1)] = 0.0
     cache: bool = False
     workers: Annotated[int, Meta(ge=1, le=1024)] | None = None
 

@@ -62,7 +62,7 @@ RECIPES: dict[RecipeName, Recipe] = {
             "--schedule trapezoid --decay-share 0.7": "run 24: decay from .3 of the run on",
             "--ema 0.998": "losses against translucency",
             "--front-share 0.5 --mirror 0.5 --recolor 0.3": "all runs",
-            "--made 0.2": "run 30; real objects alone are too few",
+            "--procedural 0.2": "run 30; real objects alone are too few",
             "--no-radial-mask": "all runs: Gaussians begin on the object",
             "--depth-weight 0.5 --ssim-weight 0.3 --novel-weight 3": "run 30",
             "--mask-l1-weight 0.3 --translucency-weight 0.12": "run 30",

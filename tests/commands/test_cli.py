@@ -53,7 +53,7 @@ def test_version(flag, capsys):
     "arguments, reason",
     [
         (["nonsense"], "unknown command 'nonsense'"),
-        (["data"], "'data' needs one of: data furniture, data made, data render"),
+        (["data"], "'data' needs one of: data furniture, data procedural, data render"),
         (["data", "nonsense"], "'data' needs one of"),
         (["--nonsense"], "unknown command '--nonsense'"),
         (["trian", "x"], "unknown command 'trian'; did you mean 'train'?"),
@@ -260,7 +260,7 @@ NONSENSE = {
         "threads": "0 -1 1000000", "lpips-weight": "nan inf -1",
         "lpips-after": "-1", "warmup-steps": "-1", "ema": "nan 1 -1",
         "log-every": "0", "val-every": "-1", "val-objects": "-1", "save-every": "0 -1",
-        "made": "-0.5 1.5",
+        "procedural": "-0.5 1.5",
         "set": "image_size=100000000 depth=1000000000 width=-8 fov=1e999 fov=NaN depth=[[",
     },
     "train DATA --lpips on": {"size": "8 15"},

@@ -20,7 +20,7 @@ from gamba_warp.images import save_image
 ROOT = Path(__file__).resolve().parents[2]
 # They need the library for everything that they do, and are loaded when that is asked for.
 ALL_OF_IT = {
-    *(ROOT / "train" / "data" / "made").glob("*.py"),
+    *(ROOT / "train" / "data" / "procedural").glob("*.py"),
     ROOT / "gamba_warp" / "compat" / "gsplat" / "strategy.py",
     ROOT / "gamba_warp" / "photo" / "plain.py",
     ROOT / "kernels" / "stress" / "run.py",

@@ -127,7 +127,14 @@ def test_the_shipped_models_recipe():
     shipped = re.search(r"gamba train (.*?)```", card, re.DOTALL)[1].replace("\\\n", "")
     shipped = parse(*shlex.split(shipped))  # its losses are those of the recipe from the start
     assert config.loss == replace(shipped.loss, lpips_after=1500)
-    for name in ("front_share", "mirror", "recolor", "made", "background", "views_per_object"):
+    for name in (
+        "front_share",
+        "mirror",
+        "recolor",
+        "procedural",
+        "background",
+        "views_per_object",
+    ):
         assert getattr(config.views, name) == getattr(shipped.views, name), name
     assert "not measured" in RECIPES["rays"].about
 
@@ -141,7 +148,18 @@ def test_the_small_models_recipe_is_its_command():
 def test_the_recipe_takes_data_without_depth(tmp_path, capsys):
     data = micro.write_dataset(tmp_path / "data")
     words = [str(data), "--recipe", "rays", "--set", *micro.MODEL, "ray_cells=4", "ray_features=8"]
-    words += ["--batch-size", "2", "--steps", "1", "--size", "16", "--lpips", "off", "--made", "0"]
+    words += [
+        "--batch-size",
+        "2",
+        "--steps",
+        "1",
+        "--size",
+        "16",
+        "--lpips",
+        "off",
+        "--procedural",
+        "0",
+    ]
     words += ["--lpips-crop", "0", "--device", "cpu", "--out", str(tmp_path / "run")]
     assert cli.run("train", words) == 0
     assert "has no depth images (gamba data render --depth): its" in capsys.readouterr().out

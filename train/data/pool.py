@@ -22,7 +22,7 @@ from gamba_warp.data.layouts import DecodedImage, ObjectFiles
 from gamba_warp.devices import quiet_warp
 from gamba_warp.errors import UserError
 from gamba_warp.untrusted.children import Failed, end_idle, run_each
-from gamba_warp.versions import MADE, require
+from gamba_warp.versions import PROCEDURAL, require
 
 from .render import DEPTH_UNIT, Views, draw_views
 from .settings import Settings
@@ -63,7 +63,7 @@ class Pool:
         Raises:
             ModuleNotFoundError: a library for making objects is not installed.
         """
-        require(*MADE)
+        require(*PROCEDURAL)
         self.options = options
         self._first = first
         self._ready: dict[int, ViewDataset] = {}
@@ -71,7 +71,7 @@ class Pool:
         self._failure: str | None = None  # reason why the pool has stopped
         self._closed = False
         self._changed = threading.Condition()
-        self._maker = threading.Thread(target=self._make, name="made objects", daemon=True)
+        self._maker = threading.Thread(target=self._make, name="procedural objects", daemon=True)
         self._maker.start()
 
     def take(self, sample: int) -> ViewDataset:
@@ -84,7 +84,7 @@ class Pool:
         with self._changed:
             self._changed.wait_for(lambda: number in self._ready or self._failure or self._closed)
             if number not in self._ready:
-                raise UserError(self._failure or "the pool of made objects is closed")
+                raise UserError(self._failure or "the pool of procedural objects is closed")
             if number in self._untaken:
                 self._untaken.remove(number)
                 oldest = sample // SLOTS - 1  # other threads may still be in the round before
@@ -133,7 +133,7 @@ class Pool:
                 if self._closed:
                     return
                 if reason:
-                    raise UserError(f"made object {number}: {reason}")
+                    raise UserError(f"procedural object {number}: {reason}")
         except Exception as error:  # ``take`` raises it in the caller's thread
             with self._changed:
                 self._failure = str(error)
@@ -145,8 +145,8 @@ class Pool:
         _, result = next(iter(run_each(made, [number], workers=1)))
         if isinstance(result, Failed):
             return result.reason
-        uid = f"made-{self.options.seed}-{number}"
-        dataset = ViewDataset({uid: partial(_files, result)}, "made", cache=False)
+        uid = f"procedural-{self.options.seed}-{number}"
+        dataset = ViewDataset({uid: partial(_files, result)}, "procedural", cache=False)
         with self._changed:
             self._ready[number] = dataset
             self._untaken.add(number)
@@ -163,7 +163,9 @@ def _order(seed: int, round_number: int) -> np.ndarray:
 
 def _make_views(number: int, seed: int, settings: Settings) -> Views:
     """Make and render an object, in a child process."""
-    from .made import make_object  # needs libraries that training without made objects does not
+    from .procedural import (
+        make_object,  # needs libraries that training without procedural objects does not
+    )
 
     quiet_warp()
     torch.set_num_threads(1)

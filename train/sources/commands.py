@@ -100,7 +100,7 @@ def data_furniture_command(out: Path, deb: Path | None = None, tree: Path | None
 
 
 @ranged
-def data_made_command(
+def data_procedural_command(
     out: Path, count: Annotated[int, Meta(ge=1, le=100_000)] = 200, seed: Seed = 0
 ) -> int:
     """Make objects of random parts, free of copyright (.glb).
@@ -112,7 +112,7 @@ def data_made_command(
         count: number of objects.
         seed: seed of all objects.
     """
-    from ..data.made import make_files
+    from ..data.procedural import make_files
 
     make_files(out, count, seed)
     print(f"{count} models in {out}; next: gamba data render {out} --out DATA")

@@ -12,8 +12,8 @@ from helpers.refusals import refused
 from gamba_warp.data.dataset import ViewDataset
 from gamba_warp.train.batches import Batches, open_data
 from gamba_warp.train.data import pool as pools
-from gamba_warp.train.data.made import make_object
 from gamba_warp.train.data.pool import Pool, PoolOptions
+from gamba_warp.train.data.procedural import make_object
 from gamba_warp.train.data.render import draw_views
 from gamba_warp.train.data.settings import Settings
 
@@ -81,9 +81,9 @@ def test_a_pool_that_begins_later_goes_on_with_the_same_images(slots, opened, in
 
 def test_other_processes_make_the_same_images(slots, opened):
     made = opened().take(0)
-    number = int(made.uids[0].removeprefix("made-3-"))
+    number = int(made.uids[0].removeprefix("procedural-3-"))
     expected = pools._files(views_of(number, 3, VIEWS), made.uids[0])
-    ours = ViewDataset({made.uids[0]: lambda uid: expected}, "made", cache=False)
+    ours = ViewDataset({made.uids[0]: lambda uid: expected}, "procedural", cache=False)
     assert_same(made.load(0), ours.load(0))
 
 
@@ -106,13 +106,13 @@ class Deadly:
 
 def test_a_process_that_dies_is_tried_again_and_then_told(slots, opened, monkeypatch):
     monkeypatch.setattr(pools, "_make_views", Deadly())
-    refused(r"made object \d+: its process died of signal 9", opened(views=None).take, 0)
+    refused(r"procedural object \d+: its process died of signal 9", opened(views=None).take, 0)
 
 
 @pytest.mark.parametrize("share, expected", [(0.5, 4), (0.3, 2), (1.0, 8)])
 def test_a_share_of_the_samples_is_made_and_the_rest_stays(data, in_process, share, expected):
     def batches(made):
-        views = {"made": made, "batch_size": 8}
+        views = {"procedural": made, "batch_size": 8}
         options = micro.options(data, data, views=views)
         return Batches(open_data(options), options, micro.ALONE, lambda number: 2)
 
@@ -121,7 +121,7 @@ def test_a_share_of_the_samples_is_made_and_the_rest_stays(data, in_process, sha
         ours, theirs = micro.take(mixed, 0), micro.take(plain, 0)
     finally:
         mixed.close()
-    made = [uid.startswith("made-") for uid in ours.uids]
+    made = [uid.startswith("procedural-") for uid in ours.uids]
     assert sum(made) == expected
     assert ours.targets.shape == theirs.targets.shape
     for number, is_made in enumerate(made):

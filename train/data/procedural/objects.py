@@ -16,8 +16,8 @@ from gamba_warp.formats.meshes import TexturedMesh
 from .composition import composition
 from .looks import Maker, finished
 
-GROUP = "made"  # one group, so that all objects are in one part of the split: train
-ATTRIBUTION = {"creator": "made by gamba data made", "licence": "CC0 1.0", "source": ""}
+GROUP = "procedural"  # one group, so that all objects are in one part of the split: train
+ATTRIBUTION = {"creator": "gamba data procedural", "licence": "CC0 1.0", "source": ""}
 TURNED = 0.12  # fraction of objects that are turned about y by any angle
 
 
@@ -54,12 +54,12 @@ def make_files(out: Path, count: int, seed: int) -> None:
         UserError: the folder has a catalogue of other objects, or cannot be written.
     """
     out = output_folder(out)
-    ours = all(path.name.startswith("made-") for path in out.glob("*.glb"))
+    ours = all(path.name.startswith("procedural-") for path in out.glob("*.glb"))
     if (out / CATALOGUE).exists() and not ours:
         raise UserError(f"{out / CATALOGUE}: lists other objects; choose another --out")
     entries = []
     for number in progress_bar(range(count), unit="object"):
-        uid = f"made-{seed}-{number:05d}"
+        uid = f"procedural-{seed}-{number:05d}"
         entry = {"model": f"{uid}.glb", "uid": uid, "name": uid.replace("-", " ")}
         entries.append({**entry, "group": GROUP, "attribution": ATTRIBUTION})
         if (out / f"{uid}.glb").exists():

@@ -7,9 +7,9 @@ from helpers.refusals import refused
 from gamba_warp.data.dataset import split_of
 from gamba_warp.formats.catalogue import find_meshes
 from gamba_warp.formats.meshes import load_mesh
-from gamba_warp.train.data.made import make_object, textures
-from gamba_warp.train.data.made.looks import MAX_FACES
-from gamba_warp.train.sources.commands import data_made_command
+from gamba_warp.train.data.procedural import make_object, textures
+from gamba_warp.train.data.procedural.looks import MAX_FACES
+from gamba_warp.train.sources.commands import data_procedural_command
 
 DRAWN = 48
 
@@ -81,22 +81,22 @@ def test_textures_are_small_and_of_colours(objects):
 
 def test_files_are_the_same_again_and_kept_where_they_are(tmp_path, capsys):
     out = tmp_path / "made"
-    assert data_made_command(out, count=4, seed=5) == 0
+    assert data_procedural_command(out, count=4, seed=5) == 0
     assert "4 models" in capsys.readouterr().out
     meshes = find_meshes(out)
-    assert [mesh.uid for mesh in meshes] == [f"made-5-0000{i}" for i in range(4)]
+    assert [mesh.uid for mesh in meshes] == [f"procedural-5-0000{i}" for i in range(4)]
     assert {split_of(mesh.group) for mesh in meshes} == {"train"}
     assert {mesh.attribution["licence"] for mesh in meshes} == {"CC0 1.0"}
     before = [mesh.path.read_bytes() for mesh in meshes]
     meshes[1].path.unlink()
     meshes[2].path.write_bytes(b"kept as it is")
-    data_made_command(out, count=4, seed=5)
+    data_procedural_command(out, count=4, seed=5)
     assert meshes[1].path.read_bytes() == before[1] and len(set(before)) == 4
     assert meshes[2].path.read_bytes() == b"kept as it is"
 
 
 def test_files_hold_the_objects(tmp_path, objects):
-    data_made_command(tmp_path, count=3, seed=5)
+    data_procedural_command(tmp_path, count=3, seed=5)
     for number, mesh in enumerate(find_meshes(tmp_path)):
         read, made = load_mesh(mesh.path), objects[number]
         assert not read.warnings and len(read.faces) == len(made.faces)
@@ -111,12 +111,14 @@ def test_files_hold_the_objects(tmp_path, objects):
 def test_another_catalogue_is_not_overwritten(tmp_path):
     (tmp_path / "catalogue.json").write_text('{"objects": []}')
     (tmp_path / "chair.glb").write_bytes(b"")
-    refused("lists other objects", data_made_command, tmp_path, count=1)
+    refused("lists other objects", data_procedural_command, tmp_path, count=1)
     assert (tmp_path / "catalogue.json").read_text() == '{"objects": []}'
 
 
 @pytest.mark.parametrize("options", [{"count": 0}, {"count": 100_001}, {"count": 1, "seed": -1}])
 def test_absurd_options_are_refused(tmp_path, options):
     name = [*options][-1]
-    refused(f"--{name} {options[name]}: must be", data_made_command, tmp_path / "out", **options)
+    refused(
+        f"--{name} {options[name]}: must be", data_procedural_command, tmp_path / "out", **options
+    )
     assert not (tmp_path / "out").exists()
