@@ -169,8 +169,8 @@ class RunConfig:
             with the paper's decoder, to compare with. Further options override it; with --help it
             shows the recipe's options and their sources.
         resume: "auto" resumes from the newest checkpoint of the run folder; else "never", or the
-            path of a checkpoint. The number of processes may be another one, if --batch-size and
-            --accumulate keep the number of objects a step.
+            path of a checkpoint. The number of processes may be another one, if the number of
+            objects a step stays the same (--batch-size and --accumulate).
         init: Start from the weights of this model file, checkpoint or run folder (same
             architecture; the averaged weights if there are any), with a fresh optimizer. Use it
             with another --out to continue with other losses or data.

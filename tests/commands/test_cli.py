@@ -236,9 +236,9 @@ def test_every_command_has_one_line_of_help():
 # Ctrl-C while ``gamba train`` opens its data; in the loop it saves and stops, see test_train.py.
 CTRL_C = """
 import os, runpy, signal, sys
-from gamba_warp.train import run
+from gamba_warp.train import loop
 signal.signal(signal.SIGINT, signal.default_int_handler)
-run.open_data = lambda *_: os.kill(os.getpid(), signal.SIGINT)
+loop.open_data = lambda *_: os.kill(os.getpid(), signal.SIGINT)
 module, *sys.argv[1:] = sys.argv[1:]
 runpy.run_module(module, run_name="__main__", alter_sys=True)
 """
