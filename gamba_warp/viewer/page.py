@@ -143,9 +143,9 @@ def viewer_parts(
 
 
 def _data_url(image: np.ndarray) -> str:
-    content, image = io.BytesIO(), Image.fromarray(to_uint8(image))
-    image.thumbnail((_IMAGE, _IMAGE))
-    image.save(content, "WEBP", quality=90)
+    content, small = io.BytesIO(), Image.fromarray(to_uint8(image))
+    small.thumbnail((_IMAGE, _IMAGE))
+    small.save(content, "WEBP", quality=90)
     return f"data:image/webp;base64,{base64.b64encode(content.getvalue()).decode()}"
 
 
