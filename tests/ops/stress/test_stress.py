@@ -190,7 +190,7 @@ def test_model_with_a_small_error_fails(monkeypatch):
     case = RandomCase("model", "uniform", 1, options)
     assert run_case(stress_model.OP, case, CPU).failure() is None
     monkeypatch.setattr(
-        "gamba_warp.model.parts.block.selective_scan_state",
+        "gamba_warp.model.parts.prefix.selective_scan_state",
         lambda *a, **k: (1 + 1e-3) * selective_scan_state(*a, **k),
     )
     assert run_case(stress_model.OP, case, CPU).failure()["what"] == "limit"
