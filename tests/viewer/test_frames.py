@@ -116,6 +116,7 @@ def test_view_shows_a_mesh_alone(browser_page, tmp_path, capsys):
         arguments = ["view", str(tmp_path / name), "--out", str(page), "--no-open-browser"]
         assert run(arguments) == 0
         opened = browser_page(page, 201, 150)
+        opened.page.evaluate("gambaViewer.setCamera({azimuth: 0.3, elevation: 0.2, distance: 3})")
         pixels.append(opened.promised("gambaViewer.rest().then(() => gambaViewer.png())"))
         assert opened.page.inner_text("#about") == "1 faces" and not opened.messages
         visible = [opened.page.is_visible(f"[data-mode={x}]") for x in ("gaussians", "mesh")]
