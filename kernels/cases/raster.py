@@ -310,9 +310,7 @@ def build(case: RandomCase, device: torch.device) -> dict[str, Tensor | None]:
     }
 
 
-def poisoned(
-    case: RandomCase, x: dict[str, Tensor | None]
-) -> tuple[dict[str, Tensor | None], Tensor]:
+def poisoned(case: RandomCase, x: dict[str, Tensor | None]) -> tuple[dict[str, Any], Tensor]:
     """Add Gaussians, each with one number that is not finite.
 
     Returns:
