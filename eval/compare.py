@@ -49,6 +49,7 @@ _MAY_DIFFER = {
     ),
     SHAPES: ("name", "definitions", "frame", "pred_axes", "reference", "distance"),
 }
+_RENAMED = {"pictures": "images", "resize_pictures": "resize_images"}  # of older reports
 Number = Annotated[float, msgspec.Meta(ge=-1e30, le=1e30)]
 Figures = dict[str, Number | None]
 
@@ -158,7 +159,8 @@ def read_report(path: Path) -> Report:
     kind = next((kind for name, kind in _KIND_BY_FIELD.items() if name in content.protocol), None)
     if kind is None:
         raise UserError(f"{path}: not a report of gamba eval-views or gamba eval-geometry")
-    report = Report(path, kind, content.protocol)
+    protocol = {_RENAMED.get(name, name): value for name, value in content.protocol.items()}
+    report = Report(path, kind, protocol)
     for number, item in enumerate(content.objects):
         name = item.get("name")
         if not isinstance(name, str) or name in report.records or name in report.failed:

@@ -350,10 +350,10 @@ class Batches:
 
     def _procedural_sample(self, number: int) -> int | None:
         """Number among this process's procedural samples; None if the sample is of a dataset."""
-        share, size = self.config.views.procedural, self.config.views.batch_size
+        fraction, size = self.config.views.procedural, self.config.views.batch_size
         batch, position = number // size // self.world.size, number % size
         local = batch * size + position  # among the samples of this process
-        before, after = math.floor(local * share), math.floor((local + 1) * share)
+        before, after = math.floor(local * fraction), math.floor((local + 1) * fraction)
         return before if after > before else None
 
     def _begin(self, number: int) -> None:
@@ -396,9 +396,9 @@ class Batches:
 
     def _numbers(self, number: int) -> range:
         """Samples of the ``number``-th batch for this process."""
-        share = self.config.views.batch_size
-        first = (number * self.world.size + self.world.rank) * share
-        return range(first, first + share)
+        fraction = self.config.views.batch_size
+        first = (number * self.world.size + self.world.rank) * fraction
+        return range(first, first + fraction)
 
     def _join_samples(self, parts: list[Future[Prepared]]) -> Prepared:
         samples = [part.result() for part in parts]

@@ -358,6 +358,19 @@ def read_state(checkpoint: Path) -> dict[str, Any]:
     return state
 
 
+def _renamed(state: dict[str, Any]) -> dict[str, Any]:
+    """Return a state with today's names of what older checkpoints name otherwise."""
+    config = state.get("config")
+    views = config.get("views") if isinstance(config, dict) else None
+    for values, old, new in (
+        (views, "made", "procedural"),
+        (state.get("new_length"), "share", "fraction"),
+    ):
+        if isinstance(values, dict) and old in values:
+            values[new] = values.pop(old)
+    return state
+
+
 def check_state(state: dict[str, Any], source: str) -> Stored:
     """Check types and ranges of a ``state.pt``, except the optimizer's part.
 
@@ -385,10 +398,7 @@ def read_run(checkpoint: Path, setup: Setup) -> tuple[Stored, LengthConfig]:
             a step; the message names the differences, and how to continue nevertheless.
     """
     source = str(checkpoint / "state.pt")
-    stored = check_state(read_state(checkpoint), source)
-    views = stored.config.get("views")
-    if isinstance(views, dict) and "made" in views:  # the option's name in older checkpoints
-        views["procedural"] = views.pop("made")
+    stored = check_state(_renamed(read_state(checkpoint)), source)
     try:
         plan = msgspec.convert(stored.config, _Plan, dec_hook=lambda kind, value: kind(value))
     except (ValueError, TypeError) as error:

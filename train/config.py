@@ -60,11 +60,11 @@ class DataConfig:
             object and step. The input image always has the model's own background.
         extra: More datasets; their training objects are added to DATA's. The objects of one
             that is named twice come twice in an epoch.
-        front_share: Share of the samples whose input is a view from the front: the object's first,
-            or another one at -35 to 35 degrees of azimuth and 0 to 20 of elevation. The other
-            samples take any view.
-        mirror: Share of the samples whose object is mirrored, with its cameras.
-        recolor: Share of the samples whose colour channels are permuted and change gamma.
+        front_share: Fraction of the samples whose input is a view from the front: the object's
+            first, or another one at -35 to 35 degrees of azimuth and 0 to 20 of elevation. The
+            other samples take any view.
+        mirror: Fraction of the samples whose object is mirrored, with its cameras.
+        recolor: Fraction of the samples whose colour channels are permuted and change gamma.
         procedural: Fraction of the samples that show procedural objects (gamba data procedural),
             which other processes make and render during the training; the others are of the
             datasets.
@@ -139,7 +139,7 @@ class OptimConfig:
         lr: Peak learning rate; after a warm-up it falls to 0 according to --schedule.
         schedule: "cosine" falls along half a cosine from the end of the warm-up; "trapezoid" stays
             at the peak and falls linearly at the end, so runs of different lengths begin alike.
-        decay_share: Share of the run in which "trapezoid" falls.
+        decay_share: Fraction of the run in which "trapezoid" falls.
         warmup_steps: Steps of the linear warm-up, a tenth of the run at most.
         ema: Decay of the weights' running average, shorter at the start; 0 turns it off.
         precision: Precision of the products in the network, by autocast; parameters, losses and

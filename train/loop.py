@@ -129,7 +129,7 @@ def train(config: TrainConfig, world: World) -> int:
 
                 begun, batches.waited = time.perf_counter(), 0.0
                 numbers = range(views.accumulate * state.step, views.accumulate * (state.step + 1))
-                rate = config.optim.lr * schedule.share(state.step, state.elapsed)
+                rate = config.optim.lr * schedule.fraction(state.step, state.elapsed)
                 weights = term_weights(config.loss, progress)
                 try:
                     outcome = run_step(map(batches.take, numbers), weights, rate)

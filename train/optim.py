@@ -31,8 +31,8 @@ SCHEDULES: dict[str, Callable[[OptimConfig, float, float, float], float]] = {
 WEIGHT_DECAY = 0.05  # paper, §4.1
 BETAS = (0.9, 0.95)
 FIRST_VIEWS, LAST_VIEWS = 2, 6  # novel views at the start and at the end (paper, §3.3)
-# After a change of length, a learning rate below the share _LOW of the new schedule's first rises
-# over the share _RISE of the remaining steps.
+# After a change of length, a learning rate below the fraction _LOW of the new schedule's first
+# rises over the fraction _RISE of the remaining steps.
 _LOW, _RISE = 0.1, 0.1
 
 
@@ -115,23 +115,23 @@ class Ema:
         for average, _ in self._pairs:
             average.requires_grad_(False)
 
-    def next_share(self) -> float:
+    def next_fraction(self) -> float:
         """Count an update, and return the fraction of the way that it takes, 1 - the decay."""
-        share = 1 - ema_decay(self.updates, self.decay)
+        fraction = 1 - ema_decay(self.updates, self.decay)
         self.updates += 1
-        return share
+        return fraction
 
     @torch.no_grad()
-    def update(self, share: Tensor) -> None:
+    def update(self, fraction: Tensor) -> None:
         """Move the average towards the model's current weights.
 
         Args:
-            share: scalar on their device, the fraction of the way.
+            fraction: scalar on their device, the fraction of the way.
         """
         averages, weights = map(list, zip(*self._pairs))
         torch_ops: Any = torch  # the names of its optimizers' own products
         steps = torch_ops._foreach_sub(weights, averages)
-        torch_ops._foreach_mul_(steps, share)
+        torch_ops._foreach_mul_(steps, fraction)
         torch_ops._foreach_add_(averages, steps)
 
 
@@ -156,13 +156,13 @@ class NewLength:
     Attributes:
         step: optimizer steps done; 0 if the length never changed.
         elapsed: seconds of training done.
-        share: the learning rate then, as a fraction of its peak.
+        fraction: the learning rate then, as a fraction of its peak.
         rises: True if the rate first moves to the new length's own schedule.
     """
 
     step: Annotated[int, Meta(ge=0, le=10**12)] = 0
     elapsed: Annotated[float, Meta(ge=0, le=1e12)] = 0.0
-    share: Annotated[float, Meta(ge=0, le=1)] = 1.0
+    fraction: Annotated[float, Meta(ge=0, le=1)] = 1.0
     rises: bool = False
 
 
@@ -193,7 +193,7 @@ class Schedule:
         assert self.minutes is not None  # a run without steps and epochs has minutes
         return min(1.0, elapsed / (60 * self.minutes))
 
-    def share(self, step: int, elapsed: float) -> float:
+    def fraction(self, step: int, elapsed: float) -> float:
         """Return the learning rate of the next step, as a fraction of its peak.
 
         Args:
@@ -208,18 +208,18 @@ class Schedule:
         if not self.since.step:
             return self._planned(step, total)
         if total <= began:
-            return self.since.share
+            return self.since.fraction
         if self.optim.schedule not in ("cosine", "trapezoid"):
             return self._planned(step, total)
         if not self.since.rises:  # the rest of the fall, to 0 at the new end
-            share, left = self.since.share, (total - step) / (total - began)
+            fraction, left = self.since.fraction, (total - step) / (total - began)
             if self.optim.schedule == "trapezoid":
                 falls = min(self.optim.decay_share * total, total - began)
-                return share * _clamped((total - step) / falls)
-            phase = math.acos(2 * share - 1) / math.pi
+                return fraction * _clamped((total - step) / falls)
+            phase = math.acos(2 * fraction - 1) / math.pi
             return _half_cosine(1 - (1 - phase) * left)
         rise = min(1.0, (step - began + 1) / (_RISE * (total - began) + 1))
-        return self.since.share + rise * (self._planned(step, total) - self.since.share)
+        return self.since.fraction + rise * (self._planned(step, total) - self.since.fraction)
 
     def _planned(self, step: float, total: float) -> float:
         """Rate of a run whose length never changed."""
@@ -243,11 +243,11 @@ class Schedule:
         """
         if (self.total, self.total or self.minutes) == (old.total, old.total or old.minutes):
             return replace(self, since=old.since), None
-        share, planned = old.share(step, elapsed), replace(self, since=NewLength())
-        wanted = planned.share(step, elapsed)
-        rises = step < self.optim.warmup_steps or share < _LOW * wanted
-        since = NewLength(step=step, elapsed=elapsed, share=share, rises=rises)
-        rates = [f"{self.optim.lr * value:.3g}" for value in (share, wanted)]
+        fraction, planned = old.fraction(step, elapsed), replace(self, since=NewLength())
+        wanted = planned.fraction(step, elapsed)
+        rises = step < self.optim.warmup_steps or fraction < _LOW * wanted
+        since = NewLength(step=step, elapsed=elapsed, fraction=fraction, rises=rises)
+        rates = [f"{self.optim.lr * value:.3g}" for value in (fraction, wanted)]
         text = f"the run's length is now {self}, not {old}: the rate continues from {rates[0]}"
         if rises:
             text += f", goes to {rates[1]}, the new length's own, in a tenth of the rest,"

@@ -111,13 +111,13 @@ def recipe_words(name: str, arguments: Sequence[str], environment: Mapping[str, 
     for text, what in ((processes, "WORLD_SIZE"), (accumulate, "--accumulate")):
         if not re.fullmatch("0*[1-9][0-9]{0,5}", text):
             raise UserError(f"{what} {text[:40]}: expected a number from 1 to 999,999")
-    share, rest = divmod(recipe.batch, int(processes) * int(accumulate))
+    fraction, rest = divmod(recipe.batch, int(processes) * int(accumulate))
     if rest:
         raise UserError(
             f"--recipe {name}: its batch of {recipe.batch} does not divide by {processes} "
             f"processes times --accumulate {accumulate}; change one of them, or give --batch-size"
         )
-    return [*words, option("batch_size"), str(share)]
+    return [*words, option("batch_size"), str(fraction)]
 
 
 def _recipe_of(name: str) -> Recipe:

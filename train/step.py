@@ -111,10 +111,10 @@ def weigh_views(terms: dict[str, Tensor], novel: float, views: int) -> dict[str,
     if novel == 1:
         return terms
     first = views / (1 + novel * (views - 1))  # the later mean divides by the number of views
-    shares = terms["rgb"].new_full((views,), novel * first)
-    shares[:1].fill_(first)
+    fractions = terms["rgb"].new_full((views,), novel * first)
+    fractions[:1].fill_(first)
     whole = {name: term for name, term in terms.items() if term.ndim == 2}  # not LPIPS of crops
-    return terms | {name: term * shares for name, term in whole.items()}
+    return terms | {name: term * fractions for name, term in whole.items()}
 
 
 class Gradients(NamedTuple):
@@ -170,7 +170,7 @@ def compute_gradients(
 def update(
     optimizer: torch.optim.Optimizer,
     ema: Ema | None,
-    share: float | Tensor,
+    fraction: float | Tensor,
     grads: Gradients,
     model: Callable,
 ) -> Tensor:
@@ -181,7 +181,7 @@ def update(
     Args:
         optimizer: fused AdamW.
         ema: the average of the weights, which is updated, too; or None.
-        share: ``ema.next_share()``, or a scalar tensor of it on the device.
+        fraction: ``ema.next_fraction()``, or a scalar tensor of it on the device.
         grads: the gradients, which the parameters have.
         model: as for ``compute_gradients``.
 
@@ -195,7 +195,7 @@ def update(
     vars(optimizer)["found_inf"] = bad  # as torch.amp.GradScaler sets it
     optimizer.step()
     if ema is not None:
-        ema.update((1 - bad) * share)
+        ema.update((1 - bad) * fraction)
     return torch.cat([stats, bad[None]])
 
 
@@ -236,22 +236,22 @@ def make_step(
         batches: Iterable[Batch],
         weights: Mapping[str, Any],
         rate: float | Tensor,
-        share: float | Tensor,
+        fraction: float | Tensor,
     ) -> Step:
         for group in optimizer.param_groups:
             group["lr"] = rate
         weighted = objective._replace(weights=weights)
         grads = compute_gradients(model, optimizer, batches, weighted, count=accumulate)
-        return Step(update(optimizer, ema, share, grads, model), grads.batch, grads.result)
+        return Step(update(optimizer, ema, fraction, grads, model), grads.batch, grads.result)
 
     def run(batches: Iterable[Batch], weights: Mapping[str, float], rate: float) -> Step:
-        share = ema.next_share() if ema else 1.0
+        fraction = ema.next_fraction() if ema else 1.0
         if graphs is None:
-            return eager(batches, weights, rate, share)
+            return eager(batches, weights, rate, fraction)
         (batch,) = batches
         number, key = graphs.number, tuple(sorted(n for n, w in weights.items() if w))
         given = {n: w if n == "novel" else number(n, w) for n, w in weights.items() if w}
-        rest = number("learning rate", rate), number("fraction of the average", share)
+        rest = number("learning rate", rate), number("fraction of the average", fraction)
         step = graphs.run(batch, key, lambda own: eager([own], given, *rest))
         return step._replace(stats=step.stats.clone())  # the next step of a graph overwrites it
 
@@ -296,7 +296,7 @@ def collapse_reason(figures: Mapping[str, float]) -> str | None:
     if figures["target_alpha"] > 0 and figures["mean_alpha"] < 0.1 * figures["target_alpha"]:
         return f"the images are almost empty (mean alpha {figures['mean_alpha']:.2g})"
     if figures["visible_share"] < 0.02:
-        return f"almost no Gaussian is visible (share {figures['visible_share']:.2g})"
+        return f"almost no Gaussian is visible (fraction {figures['visible_share']:.2g})"
     if figures["spread"] < 0.01:
         return f"the Gaussians sit in one point (spread {figures['spread']:.2g})"
     return None

@@ -118,11 +118,11 @@ class Step:
             self.plain([self.batch], self.weights, _RATE)
         events = found.key_averages()
         whole = sum(getattr(event, f"self_{kind}") for event in events) or 1
-        shares = {
+        fractions = {
             f"fraction of {part}": sum(getattr(e, kind) for e in events if e.key.startswith(names))
             for part, names in _PARTS.items()
         }
-        return {"samples": len(self.batch.uids)} | {k: v / whole for k, v in shares.items()}
+        return {"samples": len(self.batch.uids)} | {k: v / whole for k, v in fractions.items()}
 
     def check(self) -> None:
         """Check that the gradient is finite and not 0, without an oracle."""

@@ -20,17 +20,17 @@ from .shape import Points, Similarity, nearest
 STEPS: dict[Step, str] = {
     "box": "the bounding boxes get one centre and one longest side",
     "scale": "the points get one centroid and one root mean square distance from it",
-    "yaw": "of 360 turns about the truth's upward axis, a degree apart, through the centroids, "
+    "yaw": "of 360 rotations about the upward axis, a degree apart, through the centroids, "
     "which are brought together, the one with the lowest Chamfer distance of 1,024 points",
     "turn": "of 4,096 turns about any axis through the centroids, which are brought together, the "
     "32 with the lowest Chamfer distance of 256 points and 20 degrees or more apart, each followed "
     "by 20 rounds of ICP; of these the lowest Chamfer distance of 4,096 points",
     "rigid": "ICP of Open3D, point to point, of rotation and translation; correspondences within "
-    "0.2, 0.1 and 0.05 of the truth's longest side in turn",
+    "0.2, 0.1 and 0.05 of the ground truth's longest side in turn",
     "icp": "the same with scale",
 }
 
-# Largest distance of correspondences in each round of ICP; the truth's longest side is 1.
+# Largest distance of correspondences in each round of ICP; the ground truth's longest side is 1.
 ICP_DISTANCES = (0.2, 0.1, 0.05)
 
 TURNS, CANDIDATES, ROUNDS, APART = 4096, 32, 20, 20.0  # of the search, as STEPS has them

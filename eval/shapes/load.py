@@ -1,4 +1,4 @@
-"""Loading stage of an evaluation: files become ``LoadedShape``, in the truth's unit frame.
+"""Loading stage of an evaluation: files become ``LoadedShape``, in the ground truth's unit frame.
 
 ``load_gt`` and ``load_prediction`` read a file (``load_shape``), turn Gaussians into a surface,
 move the shape into the unit frame, and clean and flag its mesh. ``compare`` is the next stage.
@@ -24,7 +24,7 @@ from .shape import Mesh, Points, Shape, Similarity, positions_of, sample, unit_t
 
 HUGE = 1e18  # squares of larger coordinates overflow float32
 ROUNDED = 1e-3  # tolerance of a catalogue's rotations, which have few digits
-FAR = 1e6  # units of the truth's longest side; beyond, float32 cannot resolve a shape
+FAR = 1e6  # units of the ground truth's longest side; beyond, float32 cannot resolve a shape
 KINDS = {Gaussians: "gaussians", Mesh: "mesh", Points: "points"}
 # Axes of the frames of predictions; for "gt" they depend on the file.
 FRAME_AXES = {"unit": "z-up", "reference": "opencv"}
@@ -42,7 +42,7 @@ class LoadedShape:
 
     Attributes:
         source: as in the file.
-        shape: in the truth's unit frame.
+        shape: in the ground truth's unit frame.
         flags: of the mesh (for Gaussians: of their surface), names from ``flags.FLAGS``.
         transform: from the file's coordinates into the unit frame.
         axes: of the file: a key of ``TO_Z_UP``, ``UNKNOWN``, or for a ground truth ``DATASET``.
@@ -126,7 +126,7 @@ def load_prediction(
 
     Args:
         path: file.
-        transform: from the frame of the predictions into the truth's unit frame.
+        transform: from the frame of the predictions into the ground truth's unit frame.
         frame_axes: of that frame, a key of ``TO_Z_UP`` or ``UNKNOWN``.
         protocol: with the file's axes, the options of surfaces, and the refused flags.
 
@@ -143,7 +143,7 @@ def load_prediction(
     shape = transform.apply(source)
     reach = float(np.abs(positions_of(shape)).max())
     if not reach <= FAR:
-        raise UserError(f"{path}: reaches {reach:.3g} times the truth's longest side")
+        raise UserError(f"{path}: reaches {reach:.3g} times the ground truth's longest side")
     try:
         if isinstance(shape, Gaussians):
             if protocol.surface.method == "centers":

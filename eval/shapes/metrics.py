@@ -38,7 +38,7 @@ def compare(
     """Compute all metrics of one pair, after the protocol's alignment.
 
     Args:
-        predicted: in the truth's unit frame.
+        predicted: in the ground truth's unit frame.
         gt: in its unit frame.
         protocol: with the rules of points, voxels and alignment.
 
@@ -97,7 +97,7 @@ def take_points(shape: Mesh | Points, protocol: GeometryProtocol, seed: int) -> 
 def syncdreamer_points(mesh: Mesh) -> Points:
     """Sample like SyncDreamer's ``eval_mesh.py``: the surface visible from 16 cameras."""
     viewmats = orbit(torch.arange(16) * 22.5, 30.0, 1.5).double().numpy()
-    # From y-down, z-forward (the reference camera's world) to the truth's z-up.
+    # From y-down, z-forward (the reference camera's world) to the ground truth's z-up.
     turn = np.array([[1.0, 0, 0, 0], [0, 0, -1, 0], [0, 1, 0, 0], [0, 0, 0, 1]])
     fov = 2 * math.degrees(math.atan(128 / 280))
     K = intrinsics(256, 256, fov).double().numpy()
@@ -194,7 +194,7 @@ def surface_metrics(predicted: Points, gt: Points, protocol: GeometryProtocol) -
 
     Args:
         predicted: at least one point.
-        gt: at least one point, in the same frame; the truth's longest side is 1.
+        gt: at least one point, in the same frame; the ground truth's longest side is 1.
         protocol: with the unit, the form of the Chamfer distance and the thresholds.
 
     Returns:

@@ -325,7 +325,8 @@ def evaluate_pair(
     Args:
         pair: the files.
         protocol: of the comparison.
-        transform: of the prediction into the truth's unit frame; None: the same as the truth's.
+        transform: of the prediction into the ground truth's unit frame; None: the same as the
+            ground truth's.
 
     Returns:
         The object's record.
@@ -369,11 +370,11 @@ def evaluate_pair(
 
 
 def scale_note(shape: Mesh | Points, protocol: GeometryProtocol) -> str:
-    """Return a warning if a prediction's size is far from the truth's, which is 1; else ""."""
+    """Return a warning if a prediction's size is far from 1, the ground truth's; else ""."""
     side = float(np.ptp(positions_of(shape), axis=0).max())
     if {"box", "scale", "icp"} & {*protocol.align} or 0.1 <= side <= 10:
         return ""
-    return f"its side is {side:.3g} times the truth's: other units? --align scale fits them"
+    return f"its side is {side:.3g} times the ground truth's: other units? --align scale fits them"
 
 
 def evaluate_pairs(

@@ -78,15 +78,15 @@ DEFINITIONS = {
 class GeometryProtocol:
     """Complete definition of the numbers of ``eval-geometry``.
 
-    Fields that are lengths assume that the truth's longest side is 1. In reports, and for the
-    thresholds, it is ``unit``.
+    Fields that are lengths assume that the ground truth's longest side is 1. In reports, and for
+    the thresholds, it is ``unit``.
 
     Attributes:
         name: name of the preset, or that in a file.
         points: rule for points on surfaces, one of ``POINTS``.
         num_points: number of points per shape (for "area", and for point clouds).
         seed: seed of the random points, of both shapes.
-        unit: length of the truth's longest side: 2 for sources that use the cube [-1, 1]^3.
+        unit: length of the ground truth's longest side: 2 for sources that use the cube [-1, 1]^3.
         chamfer: the form of the Chamfer distance, one of ``FORMS``.
         thresholds: distances of the F-score.
         occupancy: rule of the Volume IoU, one of ``occupancy.RULES``; "none" skips it.
@@ -94,7 +94,7 @@ class GeometryProtocol:
         iou_voxels: number of the grid's voxels per unit of length, for "around".
         align: steps of the alignment with the ground truth, of ``align.STEPS``.
         frame: of the predictions (see the command).
-        up: upward axis of the truth's files.
+        up: upward axis of the ground truth's files.
         pred_axes: axes of the predictions' files (see the command).
         reference: index of the input view, for the frame "reference".
         distance: distance of the input camera in the model's world, for the frame "reference".

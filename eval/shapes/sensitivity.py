@@ -141,7 +141,8 @@ def vary_pair(
     Args:
         pair: the files.
         protocol: the chosen one, which loads the ground truth.
-        transform: of the prediction into the truth's unit frame; None: the same as the truth's.
+        transform: of the prediction into the ground truth's unit frame; None: the same as the
+            ground truth's.
         protocols: by label.
 
     Raises:
@@ -206,7 +207,7 @@ def _page(rows: dict[str, dict[str, Any]], count: int) -> str:
         )
     note = (
         f"The same predictions of {count} objects under one protocol a row: means over the objects "
-        "that could be evaluated. F-score: at the protocol's least threshold, where the truth's "
-        "longest side is the second number."
+        "that could be evaluated. F-score: at the protocol's least threshold, where the second "
+        "number is the ground truth's longest side."
     )
     return f"{markdown(lines)}\n\n{note}\n"

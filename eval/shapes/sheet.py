@@ -21,12 +21,12 @@ EACH = 6  # worst and best pairs of a sheet
 SIDE, FOV = 176, 40.0  # pixels; degrees
 AZIMUTHS, ELEVATION, DISTANCE = (-35.0, 145.0), 20.0, 2.4  # degrees; sides of the ground truth
 _LABEL, _GAP = 20, 6  # pixels
-# From the reference camera's world (y down, z forward) to the truth's, which is z-up.
+# From the reference camera's world (y down, z forward) to the ground truth's, which is z-up.
 _TURN = np.array([[1.0, 0, 0, 0], [0, 0, -1, 0], [0, 1, 0, 0], [0, 0, 0, 1]])
 
 
 def image_of(shape: Mesh | Points) -> np.ndarray:
-    """Draw a shape in its truth's unit frame from two sides, ``[SIDE, 2 SIDE]`` uint8 grey.
+    """Draw a shape in its ground truth's unit frame from two sides, ``[SIDE, 2 SIDE]`` uint8 grey.
 
     Faces are shaded by their angle to the camera, points by their depth.
     """

@@ -38,7 +38,7 @@ def page(report: dict[str, Any]) -> str:
     )
     return (
         f"{markdown([*means, medians[1]])}\n\nOver objects, with {100 * LEVEL:g} % bootstrap "
-        "intervals over objects. Lengths: the truth's longest side is "
+        "intervals over objects. Lengths: the ground truth's longest side is "
         f"{report['protocol']['unit']:g}. Chamfer: less is better.\n"
     )
 

@@ -15,7 +15,7 @@ from ..files import output_folder
 from ..pages.options import EXPORTED, FileOptions
 from ..surfaces.options import (
     Holes,
-    PartShare,
+    PartFraction,
     Pixels,
     Smoothing,
     SurfaceOptions,
@@ -38,7 +38,7 @@ def export_command(
     pixels: Pixels = 256,
     colors: bool = True,
     close_holes: Holes = 30,
-    min_component: PartShare = 0.01,
+    min_component: PartFraction = 0.01,
     largest: bool = False,
     smooth: Smoothing = 0,
     elevation: Elevation = 0.0,

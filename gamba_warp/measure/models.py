@@ -171,8 +171,8 @@ def mixers(settings: Settings) -> list[Variant]:
             torch.manual_seed(0)
             block = kind(config, 0, 0).to(settings.device)
             case = Case(
-                partial(_first_result, block),
-                block,
+                partial(block, state=None),
+                partial(block, state=None),
                 {"tokens": tokens},
                 tokens,
                 settings.device,
@@ -188,10 +188,6 @@ def mixers(settings: Settings) -> list[Variant]:
                 made[-1].peer = name == "transformer"
             made[-1].work = partial(_saved, case)
     return made
-
-
-def _first_result(block: GambaBlock | AttentionBlock, tokens: Tensor) -> Tensor:
-    return block(tokens, None)[0]
 
 
 def _saved(case: Case) -> dict[str, int]:

@@ -21,8 +21,8 @@ TEXTURE = 1024  # pixels; enough for the models
 Texels = Annotated[int, Meta(ge=0, le=8192)]
 Holes = Annotated[int, Meta(ge=0, le=10_000)]
 Smoothing = Annotated[int, Meta(ge=0, le=1000)]
-Share = Annotated[float, Meta(ge=0, le=1)]
-PartShare = Annotated[float, Meta(ge=0, lt=1)]
+Fraction = Annotated[float, Meta(ge=0, le=1)]
+PartFraction = Annotated[float, Meta(ge=0, lt=1)]
 
 
 @dataclass(frozen=True)
@@ -59,13 +59,13 @@ class SurfaceOptions:
     pixels: Pixels = 256
     truncation: Annotated[float, Meta(gt=0, le=1000)] = 5.0
     transmittance: Annotated[float, Meta(gt=0, lt=1)] = 0.92
-    min_alpha: Share = 0.3
-    clear_alpha: Share = 0.1
+    min_alpha: Fraction = 0.3
+    clear_alpha: Fraction = 0.1
     max_slope: Annotated[float, Meta(gt=0, le=1e6)] = 1.5
-    min_support: Share = 0.03
+    min_support: Fraction = 0.03
     level: Annotated[float, Meta(gt=0, lt=1)] = 0.5
-    min_component: PartShare = 0.01
-    min_diameter: Share = 0.0
+    min_component: PartFraction = 0.01
+    min_diameter: Fraction = 0.0
     largest: bool = False
     close_holes: Holes = 30
     smooth: Smoothing = 0

@@ -74,7 +74,7 @@ def trained(data, out, kind, most):
         outcome = step(
             [replace(batch, foreground=own, targets=targets)],
             term_weights(config.loss, progress),
-            config.optim.lr * state.schedule.share(number, 0.0),
+            config.optim.lr * state.schedule.fraction(number, 0.0),
         )
         state.step += 1
         outcomes.add(outcome.stats)

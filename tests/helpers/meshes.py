@@ -10,7 +10,7 @@ from PIL import Image
 
 from gamba_warp.eval.shapes.shape import Mesh
 from gamba_warp.train.data.settings import Settings
-from gamba_warp.train.sources.commands import Share, data_render_command
+from gamba_warp.train.sources.commands import Selection, data_render_command
 
 QUAD = """mtllib quad.mtl
 v -1 0 0
@@ -61,8 +61,8 @@ def glb(tree: dict | bytes, binary: bytes) -> bytes:
 def render_views(folder, out, **options):
     """``gamba data render`` with options by their names; returns the exit code."""
     own = {name: options.pop(name) for name in ("split", "workers") if name in options}
-    fraction = {name: options.pop(name) for name in ("shard", "limit") if name in options}
-    return data_render_command(folder, out, Settings(**options), Share(**fraction), **own)
+    selection = {name: options.pop(name) for name in ("shard", "limit") if name in options}
+    return data_render_command(folder, out, Settings(**options), Selection(**selection), **own)
 
 
 def gltf(**changes):

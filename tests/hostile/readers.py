@@ -45,14 +45,14 @@ class Reader(NamedTuple):
         read: reads a path; may write into a folder, its second argument.
         check: asserts that a result is valid, from the result, the path and the folder.
         seeds: returns the valid files.
-        share: relative number of cases; 8 for a quick reader.
+        fraction: relative number of cases; 8 for a quick reader.
         whole: True if it reads the folder of the files instead of the first file.
     """
 
     read: Callable[[Path, Path], Any]
     check: Callable[[Any, Path, Path], None]
     seeds: Callable[[], seeds.Kinds]
-    share: int = 8
+    fraction: int = 8
     whole: bool = False
 
 

@@ -28,9 +28,9 @@ ROOT = Path(__file__).resolve().parents[2]
 CORPUS = sorted((Path(__file__).parent / "corpus").glob("*.json"))
 SEED = int(os.environ.get("GAMBA_HOSTILE_SEED", "1"))
 MINUTES = float(os.environ.get("GAMBA_HOSTILE_MINUTES", "0"))  # for all readers
-EXAMPLES = 10  # cases of a reader per share, without a given time
-SHARES = sum(reader.share for reader in READERS.values())
-TRIED = [name for name, reader in READERS.items() if reader.share]
+EXAMPLES = 10  # cases of a reader per fraction, without a given time
+FRACTIONS = sum(reader.fraction for reader in READERS.values())
+TRIED = [name for name, reader in READERS.items() if reader.fraction]
 WANTED = {
     **dict.fromkeys(("raises", "exits"), "exception"),
     **dict.fromkeys(("opens", "starts", "writes"), "outside"),
@@ -91,16 +91,16 @@ def fuzz(reader, base, seed, examples, out, counts):
 @pytest.mark.parametrize("reader", TRIED)
 def test_hostile_files(reader, base):
     """Every case gives a valid result, or an error with one line that names the file."""
-    share, counts, start = READERS[reader].share, Counter(), time.monotonic()
+    fraction, counts, start = READERS[reader].fraction, Counter(), time.monotonic()
     # A rejected seed would test nothing after the first check.
     told = {case.seed: run_case(case, base) for case in valid_cases(reader)}
     for seed, verdict in told.items():
         wanted = "refused" if (reader, seed) in REFUSED else "sound"
         assert verdict.outcome == wanted, f"{reader}, {seed}: {verdict}"
-    out, end = ROOT / "out" / "hostile", start + 60 * MINUTES * share / SHARES
+    out, end = ROOT / "out" / "hostile", start + 60 * MINUTES * fraction / FRACTIONS
     turn = 0
     while turn == 0 or time.monotonic() < end:
-        examples = 100 if MINUTES else EXAMPLES * share
+        examples = 100 if MINUTES else EXAMPLES * fraction
         fuzz(reader, base, f"{SEED} {reader} {turn}", examples, out, counts)
         turn += 1
     cases_a_second = counts.total() / (time.monotonic() - start)

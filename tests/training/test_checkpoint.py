@@ -106,12 +106,12 @@ def test_killed_while_saving_leaves_the_old_one(tmp_path, model):
     assert os.listdir(tmp_path / "checkpoints") == ["step_000003"], "and cleared by the next save"
 
 
-@pytest.mark.parametrize("share", [0.0, 0.3, 0.95])
-def test_truncated_files(tmp_path, model, share):
+@pytest.mark.parametrize("fraction", [0.0, 0.3, 0.95])
+def test_truncated_files(tmp_path, model, fraction):
     path = save_checkpoint(tmp_path, 1, {"model": model}, {"t": torch.zeros(5000)}, keep=1)
     for name in ("state.pt", "model.safetensors"):
         whole = (path / name).read_bytes()
-        (path / name).write_bytes(whole[: int(share * len(whole))])
+        (path / name).write_bytes(whole[: int(fraction * len(whole))])
     refused("state.pt: damaged", read_state, path)
     refused("model.safetensors", load_weights, path / "model.safetensors", model)
 
@@ -151,17 +151,17 @@ def two(tmp_path, model):
     return [save_checkpoint(tmp_path, n, {"model": model}, {"a": n}, keep=3) for n in (1, 2)]
 
 
-def flip(path, share):
+def flip(path, fraction):
     """Change one bit of a file."""
     data = bytearray(path.read_bytes())
-    data[int(share * (len(data) - 1))] ^= 4
+    data[int(fraction * (len(data) - 1))] ^= 4
     path.write_bytes(data)
 
 
 @pytest.mark.parametrize("name", ["model.safetensors", "state.pt", "checksums.json"])
-@pytest.mark.parametrize("share", [0.0, 0.5, 0.97, 1.0])
-def test_a_flipped_bit_is_found_and_the_older_checkpoint_taken(tmp_path, two, name, share):
-    flip(two[1] / name, share)
+@pytest.mark.parametrize("fraction", [0.0, 0.5, 0.97, 1.0])
+def test_a_flipped_bit_is_found_and_the_older_checkpoint_taken(tmp_path, two, name, fraction):
+    flip(two[1] / name, fraction)
     said = []
     assert find_checkpoint(tmp_path, "auto", said.append) == two[0]
     assert len(said) == 1 and "step_000002" in said[0] and f"resuming from {two[0]}" in said[0]

@@ -114,8 +114,8 @@ def slow_depth_loss(gaussians, layers, cameras, surfaces):
             for down, right in [(s, 0) for s in SLOPE_STEPS] + [(0, s) for s in SLOPE_STEPS]:
                 pairs = [((r, c), (r + down, c + right)) for r, c in gaps]
                 slopes = [bent(gaps[b] - gaps[a]) for a, b in pairs if b in gaps]
-                share = SLOPE_WEIGHT / (2 * len(SLOPE_STEPS))
-                total = total + share * sum(slopes) / max(1, len(slopes))
+                fraction = SLOPE_WEIGHT / (2 * len(SLOPE_STEPS))
+                total = total + fraction * sum(slopes) / max(1, len(slopes))
         totals.append(total)
     return torch.stack(totals)
 

@@ -68,9 +68,9 @@ def test_two_sets_of_one_name_are_refused(roots, tmp_path):
         open_data(micro.options(roots[0], tmp_path, views={"extra": (roots[1], other)}))
 
 
-@pytest.mark.parametrize("share", [0.0, 1.0])
-def test_inputs_are_from_the_front_as_often_as_told(roots, tmp_path, share):
-    options = micro.options(roots[0], tmp_path, views={"front_share": share, "batch_size": 1})
+@pytest.mark.parametrize("fraction", [0.0, 1.0])
+def test_inputs_are_from_the_front_as_often_as_told(roots, tmp_path, fraction):
+    options = micro.options(roots[0], tmp_path, views={"front_share": fraction, "batch_size": 1})
     data = replace(open_data(options), objects=[0])
     dataset = data.train
     poses = dataset.files(0).camera_to_world
@@ -81,7 +81,7 @@ def test_inputs_are_from_the_front_as_often_as_told(roots, tmp_path, share):
     for number in range(40):
         target = micro.take(source, number).targets[0, 0]
         seen |= {v for v in range(micro.VIEWS) if views.images[v].equal(target)}
-    assert seen == (set(front_views(poses)) if share else set(range(micro.VIEWS)))
+    assert seen == (set(front_views(poses)) if fraction else set(range(micro.VIEWS)))
 
 
 @pytest.mark.parametrize("crop", [8, 17])

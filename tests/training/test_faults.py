@@ -25,13 +25,13 @@ def tree(folder):
     return {p.name: p.read_bytes() for p in folder.iterdir()}
 
 
-@pytest.mark.parametrize("share", [0.0, 0.5, 0.99])
-def test_a_full_disk_ends_training_in_one_line_with_the_checkpoint_whole(data, tmp_path, share):
+@pytest.mark.parametrize("fraction", [0.0, 0.5, 0.99])
+def test_a_full_disk_ends_training_in_one_line_with_the_checkpoint_whole(data, tmp_path, fraction):
     out = tmp_path / "run"
     assert run(data, out, length={"steps": 3}) == 0
     (saved,) = list_checkpoints(out)
     before = tree(saved)
-    limit = int(share * max(len(content) for content in before.values()))
+    limit = int(fraction * max(len(content) for content in before.values()))
     with full_at(max(limit, 4096)):  # the log has room
         refused("cannot write", run, data, out, length={"steps": 5})
     assert list_checkpoints(out) == [saved] and tree(saved) == before and not leftovers(out)

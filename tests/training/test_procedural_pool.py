@@ -109,14 +109,14 @@ def test_a_process_that_dies_is_tried_again_and_then_told(slots, opened, monkeyp
     refused(r"procedural object \d+: its process died of signal 9", opened(views=None).take, 0)
 
 
-@pytest.mark.parametrize("share, expected", [(0.5, 4), (0.3, 2), (1.0, 8)])
-def test_a_share_of_the_samples_is_made_and_the_rest_stays(data, in_process, share, expected):
+@pytest.mark.parametrize("fraction, expected", [(0.5, 4), (0.3, 2), (1.0, 8)])
+def test_a_share_of_the_samples_is_made_and_the_rest_stays(data, in_process, fraction, expected):
     def batches(made):
         views = {"procedural": made, "batch_size": 8}
         options = micro.options(data, data, views=views)
         return Batches(open_data(options), options, micro.ALONE, lambda number: 2)
 
-    plain, mixed = batches(0.0), batches(share)
+    plain, mixed = batches(0.0), batches(fraction)
     try:
         ours, theirs = micro.take(mixed, 0), micro.take(plain, 0)
     finally:

@@ -98,6 +98,8 @@ def test_other_images_of_the_same_names_are_refused(data, done, tmp_path):
     refused(words, run, other, tmp_path / "b", run={"resume": str(last)}, **groups)
     state = torch.load(last / "state.pt", weights_only=True)
     del state["content"]
+    views, length = state["config"]["views"], state["new_length"]  # with older names
+    views["made"], length["share"] = views.pop("procedural"), length.pop("fraction")
     older = save_checkpoint(tmp_path / "older", 8, {}, state, keep=1)
     for name in ("model", "ema"):
         shutil.copy(last / f"{name}.safetensors", older)
@@ -176,7 +178,7 @@ def test_views_are_weighed_and_their_mean_stays_one():
     terms = {"rgb": torch.tensor([[4.0, 1.0, 1.0], [1.0, 2.0, 3.0]]), "lpips": torch.ones(2)}
     assert weigh_views(terms, 1.0, 3) is terms
     weighed = weigh_views(terms, 0.5, 3)
-    want = torch.tensor([[6.0, 0.75, 0.75], [1.5, 1.5, 2.25]])  # shares 1.5, 0.75, 0.75
+    want = torch.tensor([[6.0, 0.75, 0.75], [1.5, 1.5, 2.25]])  # fractions 1.5, 0.75, 0.75
     torch.testing.assert_close(weighed["rgb"], want)
     assert weighed["lpips"] is terms["lpips"]
     torch.testing.assert_close(weigh_views(terms, 0.0, 3)["rgb"].mean(), torch.tensor(2.5))

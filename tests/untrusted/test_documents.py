@@ -99,7 +99,7 @@ def test_options_and_arguments_are_checked_by_their_declarations():
     @dataclass
     class Options:
         warm_up: Annotated[int, Meta(ge=1)] | None = None
-        shares: tuple[Annotated[float, Meta(ge=0, le=1)], ...] = ()
+        fractions: tuple[Annotated[float, Meta(ge=0, le=1)], ...] = ()
         flag: bool = True
         free: float = 0.0
 
@@ -111,11 +111,11 @@ def test_options_and_arguments_are_checked_by_their_declarations():
         return seed
 
     globals()["Options"] = Options  # the declarations are looked up by name
-    check_options(Options(warm_up=None, shares=(0, 1), free=float("nan")))
+    check_options(Options(warm_up=None, fractions=(0, 1), free=float("nan")))
     assert command(Options(), 7) == 7 and called == [7]
     for options, seed, words in (
         (Options(warm_up=0), 0, "--warm-up 0: must be at least 1"),
-        (Options(shares=(0.5, 2)), 0, "--shares 2: must be at least 0 and at most 1"),
+        (Options(fractions=(0.5, 2)), 0, "--fractions 2: must be at least 0 and at most 1"),
         (Options(), -1, "--seed -1: must be at least 0 and at most 4,294,967,295"),
         (Options(), 10**10**4, "--seed huge: must be"),
     ):

@@ -19,7 +19,7 @@ from gamba_warp.versions import import_open3d
 SAMPLES = 3  # rays along each side of a pixel; odd, so that one goes through the pixel's centre
 LAYERS = 8  # number of surfaces that a ray may pass through
 STEP = 1e-4  # object units behind a transparent surface at which its ray continues
-GLOSS = 0.02  # share reflected even by a black surface, so that its shape shows
+GLOSS = 0.02  # fraction reflected even by a black surface, so that its shape shows
 OPAQUE = 0.02  # transmittance below which a ray ends
 # Ranges of the lights of an object: height of the key light in degrees, its strength, that of the
 # ambient light, and the tint of both lights.

@@ -129,8 +129,8 @@ def depth_loss(gaussians: Gaussians, layers: int, cameras: Cameras, surfaces: Te
     error, valid = (x.unflatten(2, (height, width)) for x in (error, count))
     slopes = _shifted(error) - error[:, :, None]
     both = (_shifted(valid) > 0) & (valid > 0)[:, :, None]
-    share = SLOPE_WEIGHT / (2 * len(SLOPE_STEPS))
-    total = total + share * _smooth_l1_mean(slopes, both, 2).sum(-1)
+    fraction = SLOPE_WEIGHT / (2 * len(SLOPE_STEPS))
+    total = total + fraction * _smooth_l1_mean(slopes, both, 2).sum(-1)
     return total.sum(1)
 
 

@@ -35,7 +35,7 @@ _MAX_SHOWN = 20  # damaged objects that are printed; the list has all
 
 
 @dataclass(frozen=True)
-class Share:
+class Selection:
     """Selection of objects for a command.
 
     Attributes:
@@ -124,7 +124,7 @@ def data_render_command(
     folder: tyro.conf.Positional[Path],
     out: Path,
     settings: tyro.conf.OmitArgPrefixes[Settings],
-    share: tyro.conf.OmitArgPrefixes[Share],
+    selection: tyro.conf.OmitArgPrefixes[Selection],
     split: Literal["all", "train", "val", "test"] = "all",
     workers: Annotated[int, Meta(ge=0, le=1024)] = 0,
 ) -> int:
@@ -136,7 +136,7 @@ def data_render_command(
         folder: folder of meshes, at any depth; its catalogue.json may give names and attribution.
         out: the dataset to make or to continue.
         settings: options of the images.
-        share: selection of objects.
+        selection: of objects.
         split: render only the objects of this part of the set.
         workers: number of processes; 0 means one per core.
     """
@@ -150,7 +150,7 @@ def data_render_command(
         raise UserError(f"--fov-spread {spread:g}: makes fields of view outside 5 to 120 degrees")
     meshes = find_meshes(folder)
     groups = {mesh.uid: mesh.group for mesh in meshes}
-    meshes = share.of([m for m in meshes if split in ("all", split_of(m.group))])
+    meshes = selection.of([m for m in meshes if split in ("all", split_of(m.group))])
     out = output_folder(out)
     todo, damaged = still_missing(meshes, out, settings)
     if done := len(meshes) - len(todo) - len(damaged):
@@ -220,7 +220,7 @@ def data_index_command(data: tyro.conf.Positional[Path]) -> int:
 def data_gso_command(
     out: tyro.conf.Positional[Path],
     source: Path,
-    share: tyro.conf.OmitArgPrefixes[Share],
+    selection: tyro.conf.OmitArgPrefixes[Selection],
     size: Annotated[int, Meta(ge=8, le=4096)] = 512,
     workers: Annotated[int, Meta(ge=0, le=1024)] = 0,
     objects: Path | None = None,
@@ -234,7 +234,7 @@ def data_gso_command(
     Args:
         out: folder to make or to continue.
         source: folder of the set, with a folder or a zip of each model as the Fuel server has them.
-        share: selection of objects.
+        selection: of objects.
         size: pixels a side; the evaluation's are 512.
         objects: text file of other objects, one name a line: the same poses, another list.
         workers: number of processes that render; 0 means one per core.
@@ -244,7 +244,7 @@ def data_gso_command(
     from .gso import make_views, others_of, take_models, taken
 
     listed = names_of(objects)
-    names = share.of(listed)
+    names = selection.of(listed)
     out = output_folder(out)
     failures = take_models(source, out, names)
     meshes = taken(out, names)

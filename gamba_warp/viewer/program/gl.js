@@ -142,14 +142,14 @@ class Renderer {
   }
 
   // Draws one piece: Gaussians `from` to `to` of the order, or all of the centres or of the mesh,
-  // in the left `share` of the image.
-  draw(mode, camera, background, scale, from, to, share = 1) {
+  // in the left `fraction` of the image.
+  draw(mode, camera, background, scale, from, to, fraction = 1) {
     const { gl } = this;
     const width = Math.max(1, Math.round(this.width * scale)), height = Math.max(1, Math.round(this.height * scale));
     gl.bindFramebuffer(gl.FRAMEBUFFER, this.frame);
     gl.viewport(0, 0, width, height);
     gl.enable(gl.SCISSOR_TEST);
-    gl.scissor(0, 0, Math.round(share * width), height);
+    gl.scissor(0, 0, Math.round(fraction * width), height);
     if (from === 0) {
       gl.clearColor(...background);
       gl.clear(gl.COLOR_BUFFER_BIT | gl.DEPTH_BUFFER_BIT);

@@ -2,7 +2,7 @@
 // sharply and completely as the frame time allows; at rest, everything at full size.
 
 const SETTLE = 160; // milliseconds after the last motion
-const SIZES = [1, 0.8, 0.64, 0.5, 0.4, 0.32]; // shares of the canvas's sides, in motion
+const SIZES = [1, 0.8, 0.64, 0.5, 0.4, 0.32]; // fractions of the canvas's sides, in motion
 const SLOW = 42, QUICK = 21; // milliseconds of a frame: above, less is drawn; below, more
 const PIECE = 131072; // Gaussians drawn at once at rest
 const LEAST = 40000; // Gaussians that are always drawn

@@ -110,8 +110,8 @@ function frameOf({ means, scales, opacities }, seen) {
   const solid = seen.filter((i) => opacities[i] >= least);
   const ends = [0, 1, 2].map((k) => {
     const sorted = Float32Array.from(solid, (i) => means[3 * i + k]).sort();
-    return [0.005, 0.995].map((share) => {
-      const place = share * (sorted.length - 1), low = Math.floor(place), high = Math.min(low + 1, sorted.length - 1);
+    return [0.005, 0.995].map((fraction) => {
+      const place = fraction * (sorted.length - 1), low = Math.floor(place), high = Math.min(low + 1, sorted.length - 1);
       return sorted[low] + (place - low) * (sorted[high] - sorted[low]);
     });
   });

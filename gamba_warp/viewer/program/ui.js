@@ -31,13 +31,13 @@ function dressPage(about) {
 
 // Shows `wipe`: to -1 the input's image covers the left of the view, to 1 the mesh does.
 function showWipe(wipe) {
-  const share = 100 * Math.abs(wipe), seen = byId("seen"), edge = byId("edge");
+  const fraction = 100 * Math.abs(wipe), seen = byId("seen"), edge = byId("edge");
   byId("wipe").querySelector("input").value = wipe;
   seen.hidden = wipe >= 0;
   edge.hidden = wipe === 0;
-  edge.style.left = `${share}%`;
-  seen.style.clipPath = `inset(0 ${100 - share}% 0 0)`;
-  byId("canvas").style.clipPath = wipe < 0 ? `inset(0 0 0 ${share}%)` : "";
+  edge.style.left = `${fraction}%`;
+  seen.style.clipPath = `inset(0 ${100 - fraction}% 0 0)`;
+  byId("canvas").style.clipPath = wipe < 0 ? `inset(0 0 0 ${fraction}%)` : "";
 }
 
 function say(text, title = "") {

@@ -223,12 +223,13 @@ def hollowed(m: Maker, solid: Manifold, look: int) -> Manifold:
     low, high = extent(solid)
     size = high - low
     wall = m.u(0.03, 0.12) * float(size.min())
-    share = 1 - 2 * wall / size
-    if (share < 0.2).any():
+    fraction = 1 - 2 * wall / size
+    if (fraction < 0.2).any():
         return solid
     center = (low + high) / 2
     inner = m.stamp(
-        solid.translate((-center).tolist()).scale(share.tolist()).translate(center.tolist()), look
+        solid.translate((-center).tolist()).scale(fraction.tolist()).translate(center.tolist()),
+        look,
     )
     inner = inner.translate([0, float(size[1]) * m.u(0.1, 0.4), 0])
     level = high[1] - m.u(0.02, 0.3) * size[1]

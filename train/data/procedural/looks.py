@@ -71,9 +71,9 @@ class Maker:
         """Draw a number between two."""
         return float(self.rng.uniform(low, high))
 
-    def chance(self, share: float) -> bool:
+    def chance(self, fraction: float) -> bool:
         """True with this probability."""
-        return bool(self.rng.random() < share)
+        return bool(self.rng.random() < fraction)
 
     def n(self, low: int, high: int) -> int:
         """Draw an integer, bounds included."""
@@ -238,6 +238,6 @@ def _mapped(
             uvs[mine] = uv[mine] * sign * look.repeats
             continue
         size, sides = np.maximum(look.high - look.low, 1e-6), _ACROSS[axis[mine]]
-        share = (uv[mine] - look.low[sides][:, None]) / size[sides][:, None]
-        uvs[mine] = np.where(sign > 0, share, 1 - share)
+        fraction = (uv[mine] - look.low[sides][:, None]) / size[sides][:, None]
+        uvs[mine] = np.where(sign > 0, fraction, 1 - fraction)
     return uvs, ids, materials

@@ -109,13 +109,13 @@ def bend(solid: Manifold, angle: float) -> Manifold:
     return solid.warp_batch(move)
 
 
-def taper(solid: Manifold, share: float) -> Manifold:
-    """A solid whose top is ``share`` times as wide as its foot."""
+def taper(solid: Manifold, fraction: float) -> Manifold:
+    """A solid whose top is ``fraction`` times as wide as its foot."""
     (low, high) = extent(solid)
     length = max(float(high[1] - low[1]), 1e-6)
 
     def move(p: np.ndarray) -> np.ndarray:
-        scale = 1 + (share - 1) * (p[:, 1:2] - low[1]) / length
+        scale = 1 + (fraction - 1) * (p[:, 1:2] - low[1]) / length
         return np.concatenate([p[:, :1] * scale, p[:, 1:2], p[:, 2:] * scale], 1)
 
     return solid.warp_batch(move)

@@ -140,8 +140,8 @@ def _photo(rng: np.random.Generator) -> Image.Image:
     for _ in range(rng.integers(1, 5)):
         r, tall, ink = rng.uniform(5, 22), rng.uniform(0.5, 1.8), color(rng)
         x, y = rng.uniform(6, 58), rng.uniform(19, 58)
-        for shade, share in ((0.7, 1.0), (1.0, 0.85), (1.25, 0.45)):
-            s = r * share
+        for shade, fraction in ((0.7, 1.0), (1.0, 0.85), (1.25, 0.45)):
+            s = r * fraction
             draw.ellipse((x - s, y - s * tall, x + s, y + s * tall), _ink(ink * shade))
     return part
 
