@@ -79,7 +79,7 @@ def summaries(objects: list[dict[str, Any]]) -> dict[str, Any]:
 def file_warnings(done: list[dict[str, Any]]) -> list[str]:
     """Return each warning of the evaluated files, with the number of files."""
     found = []
-    for key, name in (("gt_warnings", "truths"), ("pred_warnings", "predictions")):
+    for key, name in (("gt_warnings", "ground truths"), ("pred_warnings", "predictions")):
         counts = Counter(text for record in done for text in record.get(key, ()))
         found += [f"{count} of {len(done)} {name}: {text}" for text, count in counts.items()]
     return found

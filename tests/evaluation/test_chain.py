@@ -164,13 +164,13 @@ def test_what_contradicts_a_set_is_told(tmp_path, capsys):
     assert report["mean"]["accuracy"] < TAKEN and report["warnings"] == []
     _, report = geometry(out, seen, tmp_path / "meshes", data, "--up", "y")
     assert report["mean"]["accuracy"] > 3 * TAKEN and report["axes"]["gt"] == {"opengl": 1}
-    said = "1 of 1 truths: --up y contradicts DATA"
+    said = "1 of 1 ground truths: --up y contradicts DATA"
     assert report["warnings"][0].startswith(said) and f"warning: {said}" in capsys.readouterr().err
     write(tmp_path / "others" / "lamp.ply", shape(1).apply_scale(2))
     _, report = geometry(out, seen, tmp_path / "others", data)
     assert report["mean"]["accuracy"] < TAKEN and report["axes"]["gt"] == {"unknown": 1}
     (said,) = report["warnings"]
-    assert said.startswith("1 of 1 truths: other bounding boxes than")
+    assert said.startswith("1 of 1 ground truths: other bounding boxes than")
     _, report = geometry(out, seen, tmp_path / "others", data, "--up", "z")
     assert report["warnings"] == [] and report["axes"]["gt"] == {"z-up": 1}
     meshes = TrainingMeshes(tmp_path / "others", open_dataset(data))
