@@ -16,7 +16,7 @@ from torch.nn.parallel import DistributedDataParallel
 from gamba_warp.conventions import over_background
 from gamba_warp.devices import network_precision
 from gamba_warp.gaussians import Gaussians
-from gamba_warp.render import Rendering, render
+from gamba_warp.render import render
 from gamba_warp.vision.lpips import LPIPS
 
 from .data.samples import Batch
@@ -51,21 +51,29 @@ class Objective(NamedTuple):
 
 @dataclass
 class StepResult:
-    """Result of ``forward``.
+    """Result of ``forward``, without the rasterizer's lists.
 
     Attributes:
         loss: scalar, with its graph.
         terms: unweighted terms by name, each ``[B, V+1]``.
         gaussians: predicted Gaussians, ``[B]``.
-        rendering: their images, ``[B, V+1]``.
+        rgb: their images on the batch's background, ``[B, V+1, H, W, 3]``.
+        alpha: alpha of these images, ``[B, V+1, H, W, 1]``.
         target: true images on the batch's background, ``[B, V+1, H, W, 3]``.
     """
 
     loss: Tensor
     terms: dict[str, Tensor]
     gaussians: Gaussians
-    rendering: Rendering
+    rgb: Tensor
+    alpha: Tensor
     target: Tensor
+
+    def detach(self) -> StepResult:
+        """Return the same values, without the graph and what it holds."""
+        terms = {name: term.detach() for name, term in self.terms.items()}
+        images = self.rgb.detach(), self.alpha.detach(), self.target
+        return StepResult(self.loss.detach(), terms, self.gaussians.detach(), *images)
 
 
 def forward(model: Callable, batch: Batch, objective: Objective) -> StepResult:
@@ -97,7 +105,8 @@ def forward(model: Callable, batch: Batch, objective: Objective) -> StepResult:
     )
     terms = loss_terms(inputs, weights)
     weighted = weigh_views(terms, weights.get("novel", 1.0), target.shape[1])
-    return StepResult(total_loss(weighted, weights), terms, gaussians, rendering, target)
+    images = rendering.rgb, rendering.alpha, target
+    return StepResult(total_loss(weighted, weights), terms, gaussians, *images)
 
 
 def weigh_views(terms: dict[str, Tensor], novel: float, views: int) -> dict[str, Tensor]:
@@ -124,7 +133,7 @@ class Gradients(NamedTuple):
         loss: scalar, the mean over the batches, without a graph.
         norm: scalar, the norm of the gradient before clipping.
         batch: the last batch.
-        result: result of ``forward`` on the last batch.
+        result: result of ``forward`` on the last batch, detached.
     """
 
     loss: Tensor
@@ -164,7 +173,7 @@ def compute_gradients(
         losses.append(result.loss.detach())
     parameters = [p for group in optimizer.param_groups for p in group["params"]]
     norm = torch.nn.utils.clip_grad_norm_(parameters, CLIP)
-    return Gradients(torch.stack(losses).mean(), norm, batch, result)
+    return Gradients(torch.stack(losses).mean(), norm, batch, result.detach())
 
 
 def update(
@@ -205,7 +214,7 @@ class Step(NamedTuple):
     Attributes:
         stats: ``[3]``, see ``update``.
         batch: the last batch.
-        result: result of ``forward`` on the last batch; the next step of a graph overwrites it.
+        result: of ``forward`` on the last batch, detached; the next step of a graph overwrites it.
     """
 
     stats: Tensor
@@ -275,8 +284,8 @@ def health(result: StepResult, batch: Batch) -> dict[str, Tensor]:
     visible = seen.any(-2) & (result.gaussians.opacities > VISIBLE_OPACITY)
     centred = means - means.mean(-2, keepdim=True)
     return {
-        "psnr": rendered_psnr(result.rendering.rgb, result.target).mean(),
-        "mean_alpha": result.rendering.alpha.mean(),
+        "psnr": rendered_psnr(result.rgb, result.target).mean(),
+        "mean_alpha": result.alpha.mean(),
         "target_alpha": batch.targets[..., 3].mean(),
         "visible_share": visible.float().mean(),
         "spread": centred.square().sum(-1).mean(-1).sqrt().mean(),
@@ -285,7 +294,7 @@ def health(result: StepResult, batch: Batch) -> dict[str, Tensor]:
 
 def means(step: Step) -> dict[str, float]:
     """Read the means of the loss terms of a step's last batch, and its ``health``."""
-    terms = {f"loss_{n}": term.detach().mean() for n, term in step.result.terms.items()}
+    terms = {f"loss_{n}": term.mean() for n, term in step.result.terms.items()}
     found = terms | health(step.result, step.batch)
     values = torch.stack([value.double() for value in found.values()]).tolist()
     return dict(zip(found, values))

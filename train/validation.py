@@ -145,7 +145,7 @@ def validate(
         for name, value in figures.items():
             sums.setdefault(name, []).append(value)
         if len(rows) < 2 * STRIP_OBJECTS:
-            rows += [result.target[0, :STRIP_VIEWS], result.rendering.rgb[0, :STRIP_VIEWS]]
+            rows += [result.target[0, :STRIP_VIEWS], result.rgb[0, :STRIP_VIEWS]]
     model.train(was_training)
     return {name: sum(values) / len(values) for name, values in sums.items()}, rows
 
@@ -161,11 +161,7 @@ def _far_figures(
     far = view_angles(batch.cameras)[0] > FAR_VIEW
     if not far.any():
         return {}
-    rgb, alpha, true = (
-        result.rendering.rgb[0][far],
-        result.rendering.alpha[0][far],
-        batch.targets[0][far],
-    )
+    rgb, alpha, true = result.rgb[0][far], result.alpha[0][far], batch.targets[0][far]
     figures = {
         "mask_iou_far": mask_iou(alpha[..., 0] > 0.5, true[..., 3] > 0.5).mean().item(),
         "translucency_far": _mean_translucency(alpha[..., 0]),
@@ -188,7 +184,7 @@ def _measures(
     result: StepResult, batch: Batch, lpips: Callable[[Tensor, Tensor], Tensor] | None
 ) -> dict[str, Tensor]:
     """Metrics of a validation object, each ``[V+1]``."""
-    rgb, alpha, true = result.rendering.rgb[0], result.rendering.alpha[0], batch.targets[0]
+    rgb, alpha, true = result.rgb[0], result.alpha[0], batch.targets[0]
     got, want = rgb.clamp(0, 1), result.target[0]
 
     def images(grey: float) -> tuple[Tensor, Tensor]:

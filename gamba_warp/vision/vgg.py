@@ -14,12 +14,13 @@ from torch.nn import functional as F
 from ..conventions import IMAGENET_MEAN, IMAGENET_STD
 from .weights import CONVS, WIDTHS, read_cached, read_torchvision
 
-FULL_BLOCKS = 4  # of five, computed in float32 by ``VGG16Trunk.lower``
+# Blocks of five in float32 in ``VGG16Trunk.lower``: with a gradient, and without one.
+FULL_BLOCKS, FULL_BLOCKS_OF_TARGET = 4, 1
 _LAYERS = sum(map(len, CONVS))
 
 
 class _Lower(torch.autograd.Function):
-    """``VGG16Trunk.lower``: both batches in one pass, with the gradient of the first only.
+    """``VGG16Trunk.lower``, with its gradient.
 
     The gradient of a layer's input is the convolution with the flipped kernel, in bfloat16
     throughout. It uses the ReLU masks of the forward pass; rounding the first blocks there would
@@ -27,28 +28,25 @@ class _Lower(torch.autograd.Function):
     """
 
     @staticmethod
-    def forward(ctx: Any, a: Tensor, b: Tensor, trunk: VGG16Trunk) -> tuple[Tensor, ...]:
-        x, count = torch.cat([a, b]), len(a)
+    def forward(ctx: Any, x: Tensor, trunk: VGG16Trunk) -> tuple[Tensor, ...]:
         outputs, kept, places = [], [], []
         for block, layers in enumerate(CONVS):
             if block:
                 x, place = F.max_pool2d(x, 2, return_indices=True)
-                places.append(place[:count])
+                places.append(place)
             x = x if block < FULL_BLOCKS else x.bfloat16()
             for number in map(str, layers):
                 layer = trunk.features[number] if block < FULL_BLOCKS else trunk.rounded[number]
                 x = F.relu_(layer(x))
-                kept.append(x[:count])
+                kept.append(x)
             outputs.append(x)
         ctx.save_for_backward(*kept, *places)
         ctx.turned = trunk.turned
-        first, second = ([x[part] for x in outputs] for part in (slice(count), slice(count, None)))
-        ctx.mark_non_differentiable(*second)
-        return (*first, *second)
+        return tuple(outputs)
 
     @staticmethod
     @once_differentiable
-    def backward(ctx: Any, *cotangents: Tensor) -> tuple[Tensor, None, None]:
+    def backward(ctx: Any, *cotangents: Tensor) -> tuple[Tensor, None]:
         kept, places = list(ctx.saved_tensors[:_LAYERS]), list(ctx.saved_tensors[_LAYERS:])
         passed = None
         for block, layers in reversed(list(enumerate(CONVS))):
@@ -63,7 +61,12 @@ class _Lower(torch.autograd.Function):
                 pool = torch.ops.aten.max_pool2d_with_indices_backward
                 passed = pool(passed, before, *square, places.pop())
         assert passed is not None
-        return passed.float(), None, None
+        return passed.float(), None
+
+
+def _check_size(x: Tensor) -> None:
+    if min(x.shape[-2:]) < 16:
+        raise ValueError(f"images are {x.shape[-1]}x{x.shape[-2]}; VGG16 needs 16x16 or more")
 
 
 class VGG16Trunk(nn.Module):
@@ -89,32 +92,35 @@ class VGG16Trunk(nn.Module):
         Raises:
             ValueError: the images are smaller than 16 pixels.
         """
-        if min(x.shape[-2:]) < 16:
-            raise ValueError(f"images are {x.shape[-1]}x{x.shape[-2]}; VGG16 needs 16x16 or more")
+        return self._features(x, len(CONVS))
+
+    def _features(self, x: Tensor, full: int) -> list[Tensor]:
+        """Compute the features, the blocks from ``full`` on in bfloat16."""
+        _check_size(x)
         outputs = []
         for block, layers in enumerate(CONVS):
             x = F.max_pool2d(x, 2) if block else x
-            for number in layers:
-                x = F.relu(self.features[str(number)](x))
+            x = x.bfloat16() if block >= full else x
+            for number in map(str, layers):
+                x = F.relu((self.features if block < full else self.rounded)[number](x))
             outputs.append(x)
         return outputs
 
-    def lower(self, a: Tensor, b: Tensor) -> tuple[list[Tensor], list[Tensor]]:
-        """Run ``forward`` on two batches, partly in bfloat16 where that hardly matters.
+    def lower(self, x: Tensor) -> list[Tensor]:
+        """Run ``forward``, partly in bfloat16 where that hardly matters.
 
-        bfloat16 are the whole gradient and block 5; the first four blocks are float32 in the
-        forward pass (docs/lab/step.md has the effect of each choice). Only ``a`` gets a gradient.
+        bfloat16 are the whole gradient and block 5 of a batch with a gradient, and blocks 2 to 5 of
+        one without; the rest is float32 (docs/lab/step.md has the effect of each choice).
 
-        Args:
-            a: ``[B, 3, H, W]``, normalised, H and W at least 16.
-            b: the same shape.
+        Raises:
+            ValueError: the images are smaller than 16 pixels.
         """
-        if min(a.shape[-2:]) < 16:
-            raise ValueError(f"images are {a.shape[-1]}x{a.shape[-2]}; VGG16 needs 16x16 or more")
-        if not self.turned or next(iter(self.turned.values())).device != a.device:
+        _check_size(x)
+        if not self.turned or next(iter(self.turned.values())).device != x.device:
             self._lower_weights()
-        made = _Lower.apply(a, b, self)
-        return list(made[: len(CONVS)]), list(made[len(CONVS) :])
+        if x.requires_grad:
+            return list(_Lower.apply(x, self))
+        return self._features(x, FULL_BLOCKS_OF_TARGET)
 
     @torch.no_grad()
     def _lower_weights(self) -> None:
@@ -122,7 +128,7 @@ class VGG16Trunk(nn.Module):
             for number in map(str, layers):
                 layer = self.features[number]
                 assert isinstance(layer, nn.Conv2d)
-                if block >= FULL_BLOCKS:
+                if block >= FULL_BLOCKS_OF_TARGET:
                     self.rounded[number] = copy.deepcopy(layer).bfloat16()
                 turned = layer.weight.flip(2, 3).transpose(0, 1).bfloat16()
                 self.turned[number] = turned.contiguous(memory_format=torch.channels_last)

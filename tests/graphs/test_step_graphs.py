@@ -76,6 +76,9 @@ def trained(data, out, kind, most):
             term_weights(config.loss, progress),
             config.optim.lr * state.schedule.fraction(number, 0.0),
         )
+        result = outcome.result
+        shown = result.loss, result.rgb, *result.gaussians.tensors().values()
+        assert all(x.grad_fn is None for x in shown)  # a graph keeps what it returns
         state.step += 1
         outcomes.add(outcome.stats)
         figures.append(means(outcome) | {"late": outcomes.read(1)})

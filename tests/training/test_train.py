@@ -216,11 +216,11 @@ def test_validation_is_on_training_and_held_out_objects(data, tmp_path, monkeypa
 
 def test_a_validation_is_of_images_in_range(monkeypatch):
     target = torch.ones(1, 2, 4, 4, 3)
-    shown = SimpleNamespace(rgb=target + 5, alpha=target[..., :1])
+    shown = {"rgb": target + 5, "alpha": target[..., :1]}
     front = Cameras(orbit(torch.zeros(2)), intrinsics(4, 4).expand(2, 3, 3), 4, 4)[None]
     targets = torch.ones(1, 2, 4, 4, 4)
     batch = SimpleNamespace(targets=targets, cameras=front, to=lambda device: batch)
-    result = SimpleNamespace(loss=torch.zeros(()), rendering=shown, target=target, terms={})
+    result = SimpleNamespace(loss=torch.zeros(()), **shown, target=target, terms={})
     monkeypatch.setattr(validation, "forward", lambda *_: result)
     figures, _ = validation.validate(
         torch.nn.Identity(), [batch], step.Objective({}), torch.device("cpu")
