@@ -396,9 +396,9 @@ class Batches:
 
     def _numbers(self, number: int) -> range:
         """Samples of the ``number``-th batch for this process."""
-        fraction = self.config.views.batch_size
-        first = (number * self.world.size + self.world.rank) * fraction
-        return range(first, first + fraction)
+        size = self.config.views.batch_size
+        first = (number * self.world.size + self.world.rank) * size
+        return range(first, first + size)
 
     def _join_samples(self, parts: list[Future[Prepared]]) -> Prepared:
         samples = [part.result() for part in parts]

@@ -224,7 +224,7 @@ def _blend(s: _Splats, pixels: Tensor, options: ViewOptions, r: Rounding) -> Vie
         cut |= s.unsure & (value >= options.alpha_min - band)
         cut &= reached & (s.seen | s.unsure)
         stop = on & reached & ((after[0] - T_MIN).abs() <= _band(after))
-        # a Gaussian that appears or vanishes changes its pixels by its fraction, and shows or hides
+        # a Gaussian that appears or vanishes changes its pixels by its weight, and shows or hides
         # those behind it; so does a stop with all the light that is left
         fraction = (before[0] * value * cut).sum(-1) + (before[0] * stop).amax(-1)
         top = torch.cat([s.channels[0].abs().amax(0), torch.ones(1, dtype=fraction.dtype)])

@@ -19,7 +19,7 @@ static inline void finish_stores() {
 #include "conv.h"
 namespace gamba::conv {
 
-// Of transposed rows the next task has the next tokens, whose lines these tokens fraction.
+// Of transposed rows the next task has the next tokens, whose lines these tokens share.
 template<int TOKENS, class T>
 INLINE void prefetch_down(const Rows<T>& rows, int t0, int t) {
     const int own = t - t0, lines = TOKENS * sizeof(T) / 64;

@@ -1,4 +1,4 @@
-"""Numbers that a kernel and its oracle fraction."""
+"""Numbers that a kernel and its oracle share."""
 
 ALPHA_MIN = 1.0 / 255.0  # a fainter contribution is skipped
 ALPHA_MAX = 0.99  # alpha is clamped here, so 1 / (1 - alpha) <= 100

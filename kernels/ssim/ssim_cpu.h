@@ -83,7 +83,7 @@ static void down(int task, int group, const Maps& maps) {
         const F bright = s * s + TWO_C1, dark = d0 * d0;
         const F rough = s2 - s0 * s0 + TWO_C2, odd = d2 - d0 * d0;
         const F one = splat(1.0f), p = one / (bright + dark), q = one / (rough + odd);
-        // the fractions dark and odd have, of which light = 1 - 2 unlit and shape = 1 - 2 unlike
+        // the share that dark and odd have, of which light = 1 - 2 unlit and shape = 1 - 2 unlike
         const F unlit = dark * p, unlike = odd * q;
         const F light = one - 2.0f * unlit, shape = one - 2.0f * unlike;
         if (maps.by.data) {

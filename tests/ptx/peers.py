@@ -37,7 +37,7 @@ def listed(counted: Counts) -> Kernels:
 def at_full_width(run: Callable[[int], Kernels], channels: int, batch: int) -> Kernels:
     """Return the counts for all channels and sequences, from two runs of one sequence.
 
-    What the channels fraction, such as B and C, is touched first by one of them only; so the second
+    What the channels share, such as B and C, is touched first by one of them only; so the second
     run has twice the channels, and the difference is what more of them add.
 
     Args:

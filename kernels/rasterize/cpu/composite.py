@@ -30,7 +30,7 @@ _HEADER = _CONFIG + native(Path(__file__).with_name("composite.h"))
 
 @struct
 class Workers:
-    """State that a launch's workers fraction (the next tile to take), and memory of each worker."""
+    """State that a launch's workers share (the next tile to take), and memory of each worker."""
 
     counter: wp.array[wp.int32]
     workspace: wp.array[wp.float32]

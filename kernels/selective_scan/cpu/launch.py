@@ -150,7 +150,7 @@ _unpacked = functools.lru_cache(1024)(Layout)  # shared: not to be changed
 
 
 class _Operands:
-    """Operands that the launches of one call fraction."""
+    """Operands that the launches of one call share."""
 
     def __init__(self, scan: Scan, dout: Tensor | None = None, split: bool = True):
         x, options = scan

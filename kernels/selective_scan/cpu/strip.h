@@ -19,7 +19,7 @@ INLINE auto lanes_of(
 }
 
 // A row's cache lines are adjacent, but a lane group reads one line of each row. So the rows of the
-// next strip are prefetched in their order, each lane group its fraction, while the states are
+// next strip are prefetched in their order, each lane group its share, while the states are
 // traversed: those loops leave the memory idle. The lines that this lane group will write are
 // prefetched too.
 struct Fetch {

@@ -28,10 +28,10 @@ static inline Position position_of(const In& in, int task, bool backwards) {
     const auto& sizes = in.sizes;
     const int spans = (sizes.group_blocks + sizes.span - 1) / sizes.span;
     const int parts = (sizes.group_blocks + BLOCKS - 1) / BLOCKS;
-    const int rows = sizes.segments * sizes.batch, fraction = task / rows;
+    const int rows = sizes.segments * sizes.batch, part = task / rows;
     const int row = backwards ? rows - 1 - task % rows : task % rows;
     Position p = {};
-    p.first = fraction % spans * sizes.span, p.group = fraction / spans;
+    p.first = part % spans * sizes.span, p.group = part / spans;
     p.row = row;
     if (in.ranges.shape[0] > 0) {
         const int* const own = in.ranges.data + (size_t)row * 4;

@@ -51,7 +51,7 @@ struct Position {
     int lane;         // of the block
     int d0;           // the block's first channel
     int count;        // its channels inside the group
-    int d;  // the thread's own channel; threads past the last fraction that one and are not active
+    int d;  // the thread's own channel; threads past the last share that one and are not active
     int c;  // the same channel, counted from d0
     bool active;
     int row;     // the thread's first token of a tile
