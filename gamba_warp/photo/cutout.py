@@ -63,9 +63,7 @@ _BORDER = 0.02  # covers more than this fraction of the image's border,
 _PART = 0.15  # has further parts of at least this fraction of its largest,
 _MIN_EDGE_CONTRAST = 0.06  # differs by less than this from the background beside it
 _MAX_WEAK_FRACTION = 0.3  # along more than this fraction of its outline,
-_MAX_SOFT_FRACTION = (
-    0.03  # has more than this fraction of its alpha in wide areas that are neither 0 nor 1
-)
+_MAX_SOFT_FRACTION = 0.03  # has more of its alpha than this in wide areas that are neither 0 nor 1
 
 _LIKE_GROUND = "it is coloured like the background: parts may be lost, or enclosed background kept"
 
