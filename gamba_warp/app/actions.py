@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import base64
 import contextvars
 import copy
 import html
@@ -10,9 +9,11 @@ from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 
 import gradio as gr
+import msgspec
+from msgspec import Meta
 
 from ..batch import STAGES
 from ..errors import UserError, first_line
@@ -31,9 +32,8 @@ from .cutting import (
     reset_mask,
     switch_areas,
 )
-from .guard import MAX_IMAGES, VISITOR
 from .main_thread import Cancelled, MainThread
-from .visitor_files import VisitorFiles
+from .store import Store
 
 if TYPE_CHECKING:
     from ..model.gamba import Gamba
@@ -44,6 +44,7 @@ _FRAME = (
     'allow="fullscreen" srcdoc="{document}"></iframe>'
 )
 VIEWS = "Cut-out", "Object"  # what the stage shows
+MAX_IMAGES = 12  # of one upload, and results of one page
 # Fraction of the progress bar before each stage of a mesh; not measured.
 _DONE = {
     "mesh views": 0.1,
@@ -56,6 +57,14 @@ _DONE = {
 }
 
 State = tuple[work.EditableObject, list[Path]]  # the shown result, and its files
+
+
+class Edit(msgspec.Struct):
+    """Message of the viewer about its object; ``removed`` has a bit for each Gaussian."""
+
+    key: str
+    elevation: Annotated[float, Meta(ge=work.LOWEST, le=work.HIGHEST)]
+    removed: bytes  # base64 in the message
 
 
 class Result(NamedTuple):
@@ -95,7 +104,7 @@ class Actions:
     Args:
         model: the network.
         options: options of the cut-out.
-        files: store of the visitors' files.
+        store: files of the page.
         device: device that renders.
         main_thread: runs all computations.
     """
@@ -104,14 +113,14 @@ class Actions:
         self,
         model: Gamba,
         options: CutoutOptions,
-        files: VisitorFiles,
+        store: Store,
         device: str,
         main_thread: MainThread,
     ) -> None:
         self._main_thread = main_thread
         self._model = model
         self._options = options
-        self._files = files
+        self._store = store
         self._device = device
         self._cancels: Counter[str] = Counter()  # by page
 
@@ -122,7 +131,7 @@ class Actions:
         request: gr.Request,
         progress: gr.Progress = gr.Progress(),  # noqa: B008
     ) -> tuple:
-        """Take a dropped or pasted image; the guard has checked its owner."""
+        """Take a dropped or pasted image."""
         if not given or not given.get("path"):
             return self.end_session()
         name = given.get("orig_name") or "image"
@@ -136,7 +145,7 @@ class Actions:
 
     @page_errors()
     def cancel(self, request: gr.Request) -> None:
-        """Interrupt the page's running action."""
+        """Interrupt the running action of a page, also when it is closed."""
         self._cancels[request.session_hash or ""] += 1
 
     @page_errors()
@@ -224,6 +233,8 @@ class Actions:
         """Reconstruct several images, each with the cut-out that is found; yield each result."""
         given, before, doubted = given or [], results, []
         with page_errors():
+            if len(given) > MAX_IMAGES:
+                raise UserError(f"{len(given)} images; at most {MAX_IMAGES} at once")
             for number, file in enumerate(given):
                 name = file.get("orig_name") or "image"
                 progress(number / len(given), f"Image {number + 1} of {len(given)}")
@@ -258,10 +269,14 @@ class Actions:
     @page_errors()
     def edit(self, message: dict[str, Any], results: list[Result], state: State | None) -> Any:
         """Edit one of the results; files of the shown one that were written before are dropped."""
-        made = next((each.made for each in results if each.made.key == message["key"]), None)
+        try:
+            told = msgspec.convert(message, Edit)
+        except msgspec.ValidationError as error:
+            raise UserError(f"the edit: {error}") from None
+        made = next((each.made for each in results if each.made.key == told.key), None)
         if made is None:
             raise UserError("this result has expired")
-        work.edit(made, message["elevation"], base64.b64decode(message["removed"]))
+        work.edit(made, told.elevation, told.removed)
         if state is None or state[0] is not made:
             return gr.skip()
         state[1].clear()
@@ -282,7 +297,7 @@ class Actions:
             one = copy.copy(made)  # the object may be edited meanwhile
             progress(0.1, f"Writing {work.KINDS[kind][1]}")
             mesh = work.MeshChoice.of(faces, texture, watertight)
-            inputs = one, kind, self._new_folder(request), self._device, mesh
+            inputs = one, kind, self._store.new_folder(), self._device, mesh
             if kind in work.UNRENDERED:
                 path, note = work.write(*inputs)
             else:
@@ -303,7 +318,7 @@ class Actions:
         self, results: list[Result], made: work.EditableObject, request: gr.Request
     ) -> tuple:
         """Append a result, and show it."""
-        path = self._new_folder(request) / "result.png"
+        path = self._store.new_folder() / "result.png"
         self._call(request, work.thumbnail, made, path, self._device)
         _forget_surfaces(results)
         kept = [*results, Result(made, path)][-MAX_IMAGES:]
@@ -320,7 +335,7 @@ class Actions:
         *args: Any,
         progress: Callable[[float, str], Any] | None = None,
     ) -> Any:
-        """Call a function on the main thread, as long as the page is open and nobody cancels.
+        """Call a function on the main thread, until its page cancels it or is closed.
 
         The stages of a mesh are shown as progress.
         """
@@ -339,9 +354,7 @@ class Actions:
             finally:
                 STAGES.show = None
 
-        return self._main_thread.call(
-            job, wanted=lambda: self._files.is_active(page) and self._cancels[page] == cancels
-        )
+        return self._main_thread.call(job, wanted=lambda: self._cancels[page] == cancels)
 
     def _shown(self, cut: Cut, request: gr.Request) -> tuple:
         cut, *edited = self._edited(cut, request)
@@ -351,19 +364,14 @@ class Actions:
     def _edited(self, cut: Cut, request: gr.Request) -> tuple:
         note = html.escape(self._call(request, note_of, cut))
         network = gr.update(value=cut.network, visible=bool(cut.network))
-        return cut, self._editor(cut, request), f"<p>{note}</p>", network
+        return cut, self._editor(cut), f"<p>{note}</p>", network
 
-    def _new_folder(self, request: gr.Request) -> Path:
-        inner = request.request
-        assert inner is not None  # gradio sets it for every event
-        return self._files.new_folder(inner.scope[VISITOR])
-
-    def _editor(self, cut: Cut, request: gr.Request) -> dict[str, Any]:
+    def _editor(self, cut: Cut) -> dict[str, Any]:
         """Return the editor's value, each time in a new file.
 
         gradio would rewrite the same file while the browser reads it.
         """
-        path = self._new_folder(request) / "cut-out.png"
+        path = self._store.new_folder() / "cut-out.png"
         save_image(path, editor_image(cut) / 255.0)
         value = {"background": str(path), "layers": [], "composite": str(path)}
         return gr.update(value=value, visible=True)
@@ -401,5 +409,5 @@ def _given(cut: Cut | None) -> Cut:
 
 
 def _layers(painted: dict[str, Any] | None) -> list:
-    """Read the strokes; the guard has checked the owner of the files."""
+    """Read the strokes."""
     return [read_strokes(Path(file["path"])) for file in (painted or {"layers": ()})["layers"]]

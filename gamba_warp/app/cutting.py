@@ -72,11 +72,11 @@ def cut_image(path: Path, name: str, options: CutoutOptions) -> Cut:
 
     Args:
         path: an untrusted file.
-        name: the visitor's name of it.
+        name: the user's name of it.
         options: options of the cut-out.
 
     Raises:
-        UserError: the image cannot be read; the message has the visitor's name.
+        UserError: the image cannot be read; the message has the user's name.
     """
     from ..data.preprocess import WORKING_SIZE, shrink
     from ..images import load_rgba

@@ -3,18 +3,16 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Any
 
 import gradio as gr
 from gradio import themes
-from msgspec import Meta
 
 from . import work
-from .actions import VIEWS, Actions
+from .actions import MAX_IMAGES, VIEWS, Actions
 from .cutting import FOLDER, KEEP, REMOVE, SIDE, STROKE, examples
-from .guard import MAX_IMAGES, Edit, GivenFile, Painted
-from .visitor_files import KEEP_SECONDS
 
+KEEP_SECONDS = 3600  # time that an unused page's image and results are kept
 WAITING = 16  # queued requests; further ones are rejected
 _TITLE = """<h1>Gamba</h1>
 <p>One image becomes a 3D object. Everything is computed on this machine, and nothing is sent
@@ -215,6 +213,7 @@ def build(actions: Actions) -> gr.Blocks:
             **free,
         )
         network.click(actions.cut_by_network, cut, mask, **one)
+        page.unload(actions.cancel)
         # The viewer rotates the object at once, and then tells of it.
         quick: dict[str, Any] = {"show_progress": "hidden", "api_visibility": "private"}
         elevation.input(None, elevation, None, js=_ROTATE, **quick)
@@ -223,9 +222,6 @@ def build(actions: Actions) -> gr.Blocks:
             button.click(None, elevation, elevation, js=moved, **quick)
     page.queue(api_open=False, max_size=WAITING, default_concurrency_limit=1)
     return page
-
-
-_Several: Any = Annotated[list[GivenFile], Meta(max_length=MAX_IMAGES)]
 
 
 def _brush(color: str) -> gr.Brush:
@@ -239,23 +235,6 @@ def _brush(color: str) -> gr.Brush:
 
 def _painting(choice: str) -> Any:
     return gr.update(brush=_brush(_BRUSHES[choice]))
-
-
-def inputs(page: gr.Blocks) -> dict[int, list[Any]]:
-    """Return the types of the inputs that the page sends, by the function's number."""
-    kinds: dict[type, Any] = {
-        gr.State: None,
-        gr.Image: GivenFile | None,
-        gr.HTML: Edit,
-        gr.ImageEditor: Painted | None,
-        gr.UploadButton: _Several | None,
-        gr.Dropdown: Literal[(*work.FACES, *work.TEXTURES)],  # type: ignore[invalid-type-form]
-        gr.Checkbox: bool,
-        gr.Radio: Literal[tuple(_BRUSHES)],  # type: ignore[invalid-type-form]
-    }
-    ours = {number: fn.inputs for number, fn in page.fns.items() if fn.fn is not None}
-
-    return {number: [kinds[type(block)] for block in given] for number, given in ours.items()}
 
 
 CSS = Path(__file__).parent / "look.css"

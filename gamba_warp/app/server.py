@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import os
+import secrets
 import shutil
 import signal
 import socket
@@ -25,7 +26,7 @@ from ..errors import UserError
 from ..files import only_process
 from ..untrusted.ranges import ranged
 from .main_thread import MainThread
-from .visitor_files import MAX_PER_VISITOR, VisitorFiles
+from .store import Store
 
 if TYPE_CHECKING:
     import gradio as gr
@@ -33,7 +34,7 @@ if TYPE_CHECKING:
 HOST = "127.0.0.1"
 PREFIX = "gamba-app-"
 _PAGES = 8  # pages whose images and results are kept at once
-BACKLOG = 64  # pending connections; each takes a descriptor
+_EXPECTED = ("ClientDisconnect", "LocalProtocolError")  # errors of a page that is closed
 
 
 @ranged
@@ -74,9 +75,8 @@ def app_command(
         from .interface import build
 
         main_thread = MainThread()
-        files = VisitorFiles(folder, per_visitor=max(MAX_PER_VISITOR, max_upload_mb << 20))
-        page = build(Actions(model, options, files, str(chosen), main_thread))
-        serve(page, files, listening, max_upload_mb, open_browser, main_thread)
+        page = build(Actions(model, options, Store(folder), str(chosen), main_thread))
+        serve(page, listening, max_upload_mb, open_browser, main_thread)
 
 
 @contextmanager
@@ -136,7 +136,7 @@ def listener(port: int) -> socket.socket:
     taken.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
     try:
         taken.bind((HOST, port))
-        taken.listen(BACKLOG)
+        taken.listen()
     except OSError as error:
         taken.close()
         raise UserError(f"--port {port}: {error.strerror}") from error
@@ -145,7 +145,6 @@ def listener(port: int) -> socket.socket:
 
 def serve(
     page: gr.Blocks,
-    files: VisitorFiles,
     listening: socket.socket,
     max_mb: int,
     open_browser: bool,
@@ -155,7 +154,6 @@ def serve(
 
     Args:
         page: of ``interface.build``.
-        files: the visitors' files.
         listening: socket of ``listener``.
         max_mb: largest upload, MB.
         open_browser: open the browser; the address is printed in any case.
@@ -170,11 +168,10 @@ def serve(
     import uvicorn
     from fastapi import FastAPI
 
-    from .connections import Connection
     from .guard import Guard
-    from .interface import CSS, inputs, theme
+    from .interface import CSS, theme
 
-    port = listening.getsockname()[1]
+    port, token = listening.getsockname()[1], secrets.token_urlsafe(16)
     page.state_session_capacity = _PAGES
     app = gr.mount_gradio_app(
         FastAPI(openapi_url=None),
@@ -195,21 +192,16 @@ def serve(
     )
     server = uvicorn.Server(
         uvicorn.Config(
-            Guard(app, files, inputs(page), max_mb << 20),
-            http=Connection,
+            Guard(app, token, port),
             ws="none",
             loop="asyncio",
             lifespan="on",
-            backlog=BACKLOG,
             log_level="error",
             access_log=False,
             proxy_headers=False,
         )
     )
-    new_errors = NewErrors()
-    logging.getLogger("uvicorn.error").addFilter(new_errors)
-    logging.getLogger("asyncio").addFilter(new_errors)
-    logging.getLogger("python_multipart").setLevel(logging.ERROR)  # it warns of damaged uploads
+    logging.getLogger("uvicorn.error").addFilter(_is_unexpected)
     thread = threading.Thread(target=server.run, args=[[listening]], daemon=True)
     signal.signal(signal.SIGTERM, lambda number, _: sys.exit(128 + number))
     thread.start()
@@ -218,7 +210,7 @@ def serve(
             if not thread.is_alive():
                 raise RuntimeError("the server did not start")
             time.sleep(0.01)
-        address = f"http://{HOST}:{port}/"
+        address = f"http://{HOST}:{port}/?token={token}"
         print(f"{address} (Ctrl-C ends it)", flush=True)
         if open_browser:
             webbrowser.open(address)
@@ -230,25 +222,7 @@ def serve(
         thread.join(timeout=5)
 
 
-class NewErrors(logging.Filter):
-    """Log filter that passes each error once per place in the code, against flooding.
-
-    Errors of a client that disconnects are dropped.
-    """
-
-    def __init__(self) -> None:
-        super().__init__()
-        self._seen: set[tuple[str, str, int]] = set()
-
-    def filter(self, record: logging.LogRecord) -> bool:
-        """Return True if a record is logged."""
-        kind, _, tb = record.exc_info or (None, None, None)
-        if kind is None:
-            return True
-        while tb and tb.tb_next:
-            tb = tb.tb_next
-        file, line = (tb.tb_frame.f_code.co_filename, tb.tb_lineno) if tb else ("", 0)
-        error = kind.__name__, file, line
-        new = error not in self._seen
-        self._seen.add(error)
-        return new and kind.__name__ not in ("ClientDisconnect", "LocalProtocolError")
+def _is_unexpected(record: logging.LogRecord) -> bool:
+    """Return True if a record is logged."""
+    kind = (record.exc_info or (None,))[0]
+    return kind is None or kind.__name__ not in _EXPECTED

@@ -57,7 +57,7 @@ def opened(served, browser_page):
     found.page.goto(served.address)
     found.page.wait_for_selector("#image input[type=file]", state="attached")
     yield found
-    here = (served.address, "data:", "blob:")
+    here = (f"http://{served.host}/", "data:", "blob:")
     assert not [url for url in found.asked if not url.startswith(here)], "all stays on this machine"
     assert not found.complaints
 
@@ -400,7 +400,7 @@ def test_too_large_an_upload_is_refused(opened, served, tmp_path):
 
 
 def test_a_port_in_use_and_a_bad_model_are_one_line(served, tmp_path):
-    port = served.address.rstrip("/").rpartition(":")[2]
+    port = served.host.rpartition(":")[2]
     before = served.folders()
     for options, said, reason in (
         (["--port", port], "", f"gamba: --port {port}: Address already in use\n"),

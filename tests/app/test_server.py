@@ -2,68 +2,48 @@
 
 import asyncio
 import contextlib
-import hashlib
-import json
-import logging
 import os
 import signal
 import threading
 import time
-from pathlib import Path
 
 import pytest
-from helpers.app import FORM, form
 from helpers.refusals import refused
 
-from gamba_warp.app import guard, main_thread, server, visitor_files
+from gamba_warp.app import guard, main_thread, server
 from gamba_warp.app.main_thread import MainThread
-from gamba_warp.app.visitor_files import VisitorFiles
+from gamba_warp.app.store import Store
 from gamba_warp.errors import UserError
 
-
-def headers_of(token, length, host="localhost"):
-    """Headers of an upload."""
-    said = {"host": host, "content-type": FORM["Content-Type"], "content-length": str(length)}
-    said["cookie"] = token and f"gamba-visitor={token}"
-    return [(name.encode(), value.encode()) for name, value in said.items() if value is not None]
+TOKEN = "a-token"
 
 
-def answered(host, kind="http", path="/", method="GET", files=None, body=b"", token=None, more=()):
+def answered(host, kind="http", path="/", cookie=f"gamba-1={TOKEN}", more=()):
     """Return the guard's messages for a request, and the scopes that it passes on."""
     sent, inside = [], []
 
     async def app(scope, receive, send):
         inside.append(scope)
-        answer = [(b"a", b"b"), (b"cookie", b"as gradio repeats it")]
-        await send({"type": "http.response.start", "status": 200, "headers": answer})
+        await send({"type": "http.response.start", "status": 200, "headers": [(b"a", b"b")]})
         await send({"type": "http.response.body", "body": b""})
-
-    async def receive():
-        return {"type": "http.request", "body": body}
 
     async def send(message):
         sent.append(message)
 
-    headers = [*more, *headers_of(token, len(body), host)]
+    said = {"host": host, "cookie": cookie}
+    headers = [*more, *((k.encode(), v.encode()) for k, v in said.items() if v is not None)]
     place, _, asked = path.partition("?")
-    scope = {"type": kind, "headers": headers, "path": place, "method": method}
+    scope = {"type": kind, "headers": headers, "path": place, "method": "GET"}
     scope["query_string"] = asked.encode()
-    layer = guard.Guard(app, files or VisitorFiles(Path("unused")), {}, 1 << 20)
-    asyncio.run(layer(scope, receive, send))
+    asyncio.run(guard.Guard(app, TOKEN, 1)(scope, None, send))
     return sent, inside
-
-
-def visitor_of(token):
-    """The name of a visitor's folder."""
-    return hashlib.sha256(token.encode()).hexdigest()[:32]
 
 
 @pytest.mark.parametrize("host", ["127.0.0.1:7860", "localhost:1", "127.0.0.1", "localhost"])
 def test_our_own_names_are_let_in(host):
     sent, inside = answered(host)
     assert inside and sent[0]["status"] == 200
-    headers = dict(sent[0]["headers"])
-    assert headers[b"a"] == b"b" and b"cookie" not in headers, "a script could read it"
+    assert dict(sent[0]["headers"])[b"a"] == b"b"
 
 
 @pytest.mark.parametrize("host", ["localhost", "evil.example"])
@@ -92,36 +72,13 @@ def test_what_a_browser_says_it_says_once(name):
             assert not inside and sent[0]["status"] == 421, pair
 
 
-@pytest.mark.parametrize("place", ["heartbeat/abc", "queue/data?session_hash=abc"])
-def test_a_session_is_told_apart_by_its_visitor(place):
-    """When a heartbeat ends, gradio drops the state of that visitor's session only."""
-    path = f"/gradio_api/{place}"
-    for token in ("a" * 32, "b" * 32):
-        [scope] = answered("localhost", path=path, token=token)[1]
-        got = f"{scope['path']}?{scope['query_string'].decode()}"
-        assert scope["gamba.page"] == f"abc{visitor_of(token)}"
-        assert got.rstrip("?") == path + visitor_of(token)
-    sent, inside = answered("localhost", path=path)
-    assert not inside and sent[0]["status"] == 403
-
-
-@pytest.mark.parametrize(
-    "values",
-    [
-        *(["bytes=0-1,2-3"], ["bytes=0-1-2"], ["bytes=-"], ["bytes="], ["items=0-1"], ["0-1"]),
-        *(["bytes=\xb2-\xb3"], ["bytes=0-" + "9" * 5000], ["bytes=0-1"] * 2),
-    ],
-)
-def test_other_ranges_are_ignored(values):
-    more = [(b"range", value.encode("latin-1")) for value in values]
-    [scope] = answered("localhost", path="/theme.css", more=more)[1]
-    assert not [name for name, _ in scope["headers"] if name == b"range"]
-
-
-@pytest.mark.parametrize("more", [(b"content-length", b"5"), (b"transfer-encoding", b"chunked")])
-def test_who_only_asks_sends_no_body(more):
-    sent, inside = answered("localhost", more=[more])
-    assert not inside and sent[0]["status"] == 400
+@pytest.mark.parametrize("method, foreign", [("GET", False), ("HEAD", False), ("POST", True)])
+def test_a_form_of_another_page_is_refused(method, foreign):
+    """A browser may send a form of another page without an Origin; a link only asks."""
+    headers = {"Host": "127.0.0.1:9", "Sec-Fetch-Site": "cross-site", "Sec-Fetch-Mode": "navigate"}
+    assert guard.is_foreign(method, headers.items()) == foreign
+    own = headers | {"Sec-Fetch-Site": "same-origin", "Origin": "http://127.0.0.1:9"}
+    assert not guard.is_foreign(method, own.items())
 
 
 @pytest.mark.parametrize(
@@ -138,157 +95,22 @@ def test_other_names_are_refused(host):
     assert not inside and sent == [{"type": "websocket.close", "code": 1008}]
 
 
-def test_a_cookie_is_given_once_and_is_the_visitor():
-    def cookie(token):
-        return dict(answered("localhost", token=token)[0][0]["headers"]).get(b"set-cookie")
-
-    first, second = cookie(None), cookie("../../etc")
-    assert second and first != second and b"; HttpOnly; SameSite=Lax; Path=/" in first
-    assert cookie(first.decode().partition("=")[2].partition(";")[0]) is None
+def test_the_token_becomes_a_cookie():
+    sent, inside = answered("localhost", path=f"/?token={TOKEN}", cookie=None)
+    headers = dict(sent[0]["headers"])
+    assert not inside and sent[0]["status"] == 303 and headers[b"location"] == b"/"
+    assert headers[b"set-cookie"].startswith(f"gamba-1={TOKEN}; HttpOnly;".encode())
 
 
-def test_all_uploads_together_are_bounded(tmp_path):
-    """A megabyte each; the oldest are removed."""
-    files, paths = VisitorFiles(tmp_path, limit=4 << 20), []
-    for k in range(9):
-        body = form(bytes([k]) * (1 << 20))
-        request = {"path": "/gradio_api/upload", "method": "POST", "body": body}
-        sent, _ = answered("localhost", files=files, token="a" * 32, **request)
-        assert sent[0]["status"] == 200
-        paths.append(Path(json.loads(sent[1]["body"])[0]))
-        os.utime(paths[-1], (time.time() - 100 + k,) * 2)
-        kept = [path for path in tmp_path.rglob("*") if path.is_file()]
-        assert sum(path.stat().st_size for path in kept) <= files.limit
+def test_the_oldest_files_are_removed(tmp_path):
+    kept, paths = Store(tmp_path, limit=4000), []
+    for age in range(9, 0, -1):
+        paths.append(kept.new_folder() / "image.png")
+        paths[-1].write_bytes(bytes(1000))
+        os.utime(paths[-1], (time.time() - age,) * 2)
+    kept.new_folder()
     assert [path.is_file() for path in paths] == [False] * 5 + [True] * 4
     assert not paths[0].parent.exists()
-
-
-def kept_file(files, visitor, size=1000):
-    path = files.new_folder(visitor, size) / "image.png"
-    path.write_bytes(bytes(size))
-    return path
-
-
-def test_files_of_who_is_here_stay(tmp_path):
-    """Files of inactive visitors are removed first; without any, a new file is refused."""
-    files = VisitorFiles(tmp_path, limit=3000)
-    with files.visited("a"):
-        first, left, last = (kept_file(files, visitor) for visitor in "aba")
-        for path, age in ((first, 90), (left, 50), (last, 9)):
-            os.utime(path, (time.time() - age,) * 2)
-        newer = kept_file(files, "c")
-        assert first.is_file() and last.is_file() and not left.exists(), "though it was newer"
-        with files.visited("c"), pytest.raises(UserError, match="leave no room"):
-            files.new_folder("d", 1000)
-        assert newer.is_file() and not (tmp_path / "d").exists()
-        os.utime(first, (time.time() - visitor_files.KEEP_SECONDS - 9,) * 2)
-        files.sweep()
-        assert first.is_file(), "the page is open"
-    files.sweep()
-    assert not first.exists() and last.is_file() and newer.is_file()
-
-
-def test_a_visitor_displaces_its_own_files_alone(tmp_path):
-    files = VisitorFiles(tmp_path, limit=9000, per_visitor=2000)
-    other = kept_file(files, "b")
-    os.utime(other, (1 << 30,) * 2)
-    os.utime(other, (time.time() - 99,) * 2)
-    mine = [kept_file(files, "a") for _ in range(4)]
-    assert [path.is_file() for path in (other, *mine)] == [True, False, False, True, True]
-
-
-def dawdled(files, uploads, seconds=0.3):
-    """Return statuses of stalled simultaneous uploads (token, bytes received), and the guard."""
-    sent = [[] for _ in uploads]
-    layer = guard.Guard(None, files, {}, 1 << 20)
-
-    async def ask(k, token, content):
-        for _ in range(50 * k):  # one after the other
-            await asyncio.sleep(0)
-        pieces = [content[at : at + 65536] for at in range(0, len(content), 65536)]
-
-        async def receive():
-            if not pieces:
-                await asyncio.sleep(60)
-            await asyncio.sleep(0)
-            return {"type": "http.request", "body": pieces.pop(0), "more_body": True}
-
-        async def send(message):
-            sent[k].append(message.get("status"))
-
-        scope = {"type": "http", "method": "POST", "path": "/gradio_api/upload"}
-        await layer({**scope, "headers": headers_of(token * 32, 1 << 20)}, receive, send)
-
-    async def come():
-        tasks = [asyncio.create_task(ask(k, *upload)) for k, upload in enumerate(uploads)]
-        await asyncio.wait(tasks, timeout=seconds)
-        for task in tasks:
-            task.cancel()
-        await asyncio.gather(*tasks, return_exceptions=True)
-
-    asyncio.run(come())
-    return [statuses[0] if statuses else None for statuses in sent], layer
-
-
-def test_what_is_stated_takes_no_room(tmp_path):
-    """A visitor announces a megabyte sixteen times; files and page of another stay."""
-    files = VisitorFiles(tmp_path, limit=3 << 20)
-    other = kept_file(files, visitor_of("b" * 32))
-    empty = form(b"")[:-20]
-    assert dawdled(files, [("a", empty)] * 16 + [("b", empty)])[0] == [None] * 17
-    assert other.is_file()
-
-
-def test_what_has_come_in_is_bounded(tmp_path):
-    """Limit uploads per visitor and in total; an ended upload frees its fraction."""
-    content = form(bytes(500_000))[:-20]
-    statuses, layer = dawdled(
-        VisitorFiles(tmp_path, per_visitor=700_000), [("a", content), ("a", content)]
-    )
-    assert sorted(statuses, key=str) == [503, None] and not layer._incoming
-    each = [(token, content) for token in "abc"]
-    statuses, layer = dawdled(VisitorFiles(tmp_path, limit=1_200_000), each)
-    assert sorted(statuses, key=str) == [503, None, None] and not layer._incoming
-
-
-def test_requests_of_one_visitor_are_bounded(tmp_path):
-    empty = form(b"")[:-20]
-    files = VisitorFiles(tmp_path)
-    assert dawdled(files, [("a", empty)] * 17 + [("b", empty)])[0] == [None] * 16 + [503, None]
-
-
-@pytest.mark.parametrize("name", ["_CALL_SECONDS", "UPLOAD_SECONDS"])
-def test_a_body_that_does_not_come_is_refused(monkeypatch, name):
-    monkeypatch.setattr(guard, name, 0.05)
-    path = "/gradio_api/upload" if "UPLOAD" in name else "/gradio_api/queue/join"
-    sent, start = [], [form(b"")[:-20]]
-
-    async def receive():
-        await asyncio.sleep(0.01)
-        return {"type": "http.request", "body": start.pop() if start else b" ", "more_body": True}
-
-    async def send(message):
-        sent.append(message)
-
-    scope = {"type": "http", "method": "POST", "path": path, "headers": headers_of("a" * 32, 9999)}
-    layer = guard.Guard(None, VisitorFiles(Path("unused")), {}, 1 << 20)
-    asyncio.run(asyncio.wait_for(layer(scope, receive, send), 10))
-    assert sent[0]["status"] == 408 and b"took too long" in sent[1]["body"]
-
-
-def test_old_files_go_by_themselves(tmp_path, monkeypatch):
-    monkeypatch.setattr(guard, "KEEP_SECONDS", 0.06)
-    monkeypatch.setattr(visitor_files, "KEEP_SECONDS", 0.06)
-    files = VisitorFiles(tmp_path)
-    path = files.new_folder("a") / "image.png"
-    path.write_bytes(b"x")
-
-    async def lives(scope, receive, send):
-        await asyncio.sleep(0.3)
-
-    assert path.exists()
-    asyncio.run(guard.Guard(lives, files, {}, 1)({"type": "lifespan"}, None, None))
-    assert not path.exists() and not path.parent.exists()
 
 
 def test_nothing_of_the_environment_opens_the_server(monkeypatch, tmp_path):
@@ -364,23 +186,6 @@ def test_a_port_in_use_is_one_line():
         assert host == "127.0.0.1" and 0 < port < 65536
         refused(f"--port {port}: Address already in use", server.listener, port)
     server.listener(port).close()
-
-
-def test_a_defect_is_logged_once_and_a_browser_that_leaves_is_none():
-    new = server.NewErrors()
-
-    def logged(kind):
-        try:
-            raise kind
-        except Exception as error:
-            info = (type(error), error, error.__traceback__)
-        return new.filter(logging.LogRecord("uvicorn.error", 40, "", 1, "x", (), info))
-
-    requests = pytest.importorskip("starlette.requests", reason="needs gradio")
-    assert not logged(requests.ClientDisconnect())
-    assert [logged(ZeroDivisionError()) for _ in range(3)] == [True, False, False]
-    assert logged(OSError()), "another defect of the same line"
-    assert new.filter(logging.LogRecord("uvicorn.error", 40, "", 1, "x", (), None))
 
 
 def test_jobs_are_done_by_the_one_that_works():

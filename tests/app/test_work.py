@@ -15,7 +15,7 @@ from helpers.model import quick, run_reconstruct
 from helpers.refusals import refused
 from PIL import Image
 
-from gamba_warp.app import cutting, guard, main_thread, work
+from gamba_warp.app import cutting, main_thread, work
 from gamba_warp.batch import STAGES
 from gamba_warp.cameras import orbit
 from gamba_warp.files import STARTER
@@ -359,7 +359,7 @@ def page(made, tmp_path, monkeypatch):
     monkeypatch.setattr(work, "viewer", lambda made: made.name)
     monkeypatch.setattr(work, "thumbnail", lambda *_: None)
     thread = Mock(call=lambda function, wanted: function())
-    return actions.Actions(None, None, Mock(new_folder=lambda _: tmp_path), "cpu", thread)
+    return actions.Actions(None, None, Mock(new_folder=lambda: tmp_path), "cpu", thread)
 
 
 def results_of(page, names, results):
@@ -372,7 +372,7 @@ def results_of(page, names, results):
 def test_the_strip_keeps_the_last_results(page, monkeypatch):
     said = []
     monkeypatch.setattr("gradio.Info", said.append)
-    results, most = [], guard.MAX_IMAGES
+    results, most = [], 12
     for count in (most - 1, 1, 1):
         assert not said
         *_, (results, strip) = results_of(
@@ -428,7 +428,8 @@ def test_what_waits_for_the_device(page, made, tmp_path):
 
     page._main_thread.call = Mock(side_effect=AssertionError("it waits"))
     blocks = build(page)
-    events = {each.targets[0][0]: each for each in blocks.fns.values() if each.fn}
+    called = [each for each in blocks.fns.values() if each.fn and each.targets[0][1] != "unload"]
+    events = {each.targets[0][0]: each for each in called}
     events = {blocks.blocks[number].elem_id: each for number, each in events.items()}
     for kind in work.KINDS:
         waits = events[f"file-{kind}"].concurrency_id == events["make"].concurrency_id

@@ -32,7 +32,7 @@ class Served:
 
     @property
     def host(self) -> str:
-        return self.address.removeprefix("http://").rstrip("/")
+        return self.address.removeprefix("http://").partition("/")[0]
 
     def folders(self) -> list[str]:
         return sorted(p.name for p in self.temporary.glob("gamba-app-*"))
@@ -55,7 +55,7 @@ def serving(temporary: Path) -> Iterator[Served]:
         env=environment,
     )
     lines = [process.stdout.readline() for _ in range(4)]
-    match = re.match(r"(http://127\.0\.0\.1:\d+/) \(Ctrl-C ends it\)$", lines[-1])
+    match = re.match(r"(http://127\.0\.0\.1:\d+/\?token=\S+) \(Ctrl-C ends it\)$", lines[-1])
     assert match, "".join(lines) + process.communicate(timeout=10)[1]
     parts = ("torch", "the model", "the page's libraries")
     assert lines[:3] == [f"loading {part}\n" for part in parts]
@@ -72,13 +72,6 @@ class Answer:
     headers: dict[str, str]
     body: bytes
 
-    @property
-    def line(self) -> str:
-        """The one line of a refusal."""
-        text = self.body.decode()
-        assert text.count("\n") == 1 and text.endswith("\n"), text
-        return json.loads(text)["detail"] if text.startswith("{") else text.strip()
-
 
 def form(content: bytes, name: str = "a.png") -> bytes:
     """The body of an upload."""
@@ -88,7 +81,7 @@ def form(content: bytes, name: str = "a.png") -> bytes:
 
 @dataclass
 class Program:
-    """Program on the same machine that sends any requests, with a cookie."""
+    """Program on the same machine that sends any requests; ``opened`` has the cookie."""
 
     host: str
     headers: dict[str, str] = field(default_factory=dict)
@@ -105,9 +98,11 @@ class Program:
         link.close()
         return answer
 
-    def opened(self) -> Program:
-        """Request the page first, like a browser."""
-        self.headers["Cookie"] = self.ask("/").headers["set-cookie"].partition(";")[0]
+    def opened(self, address: str) -> Program:
+        """Open the printed address first, like a browser."""
+        answer = self.ask(address.removeprefix(f"http://{self.host}"))
+        assert answer.status == 303 and answer.headers["location"] == "/", answer
+        self.headers["Cookie"] = answer.headers["set-cookie"].partition(";")[0]
         return self
 
     def upload(self, content: bytes, name: str = "a.png") -> str:
