@@ -207,6 +207,11 @@ RENAMED = {
     "--mesh-frame": "--mesh-axes",
     "--no-lpips": "--lpips off",
     "--made": "--procedural",
+    "--front-share": "--front-fraction",
+    "--decay-share": "--decay-fraction",
+    "--mirror": "--flip",
+    "--recolor": "--color-jitter",
+    "--recompute": "--activation-checkpointing",
     "--save-pictures": "--save-images",
     "--resize-pictures": "--resize-images",
 }

@@ -311,11 +311,11 @@ class Batches:
             background = torch.from_numpy(rng.random(3, dtype=np.float32))
         # A separate generator, so that runs without augmentation stay the same.
         chance = np.random.default_rng([seed, 3, number])
-        front = chance.random() < views.front_share
+        front = chance.random() < views.front_fraction
         pick = int(chance.integers(2**32))
         change = None
-        if views.mirror or views.recolor:
-            change = draw_change(chance, views.mirror, views.recolor)
+        if views.flip or views.color_jitter:
+            change = draw_change(chance, views.flip, views.color_jitter)
         surfaces = self.config.loss.depth_weight > 0
 
         def loaded(dataset: ViewDataset, index: int) -> Batch:

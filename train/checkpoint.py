@@ -184,7 +184,7 @@ class RunState:
             weights = {n: read_weights_of(files[n], model) for n, model in self.models.items()}
             return stored, length, moments, weights
 
-        stored, length, moments, weights = setup.world.on_main(read)
+        stored, length, moments, weights = setup.world.broadcast_from_main(read)
         for name, model in self.models.items():
             model.load_stored_state(weights[name])
         if self.ema is not None:
@@ -358,16 +358,29 @@ def read_state(checkpoint: Path) -> dict[str, Any]:
     return state
 
 
+# Names in checkpoints of earlier versions, by group of the options.
+_RENAMED = {
+    "views": {
+        "made": "procedural",
+        "front_share": "front_fraction",
+        "mirror": "flip",
+        "recolor": "color_jitter",
+    },
+    "optim": {"decay_share": "decay_fraction"},
+    "run": {"recompute": "activation_checkpointing"},
+}
+
+
 def _renamed(state: dict[str, Any]) -> dict[str, Any]:
     """Return a state with today's names of what older checkpoints name otherwise."""
     config = state.get("config")
-    views = config.get("views") if isinstance(config, dict) else None
-    for values, old, new in (
-        (views, "made", "procedural"),
-        (state.get("new_length"), "share", "fraction"),
-    ):
-        if isinstance(values, dict) and old in values:
-            values[new] = values.pop(old)
+    groups = dict(config) if isinstance(config, dict) else {}
+    groups["new_length"] = state.get("new_length")
+    for group, names in {**_RENAMED, "new_length": {"share": "fraction"}}.items():
+        values = groups.get(group)
+        for old, new in names.items():
+            if isinstance(values, dict) and old in values:
+                values[new] = values.pop(old)
     return state
 
 

@@ -60,11 +60,11 @@ class DataConfig:
             object and step. The input image always has the model's own background.
         extra: More datasets; their training objects are added to DATA's. The objects of one
             that is named twice come twice in an epoch.
-        front_share: Fraction of the samples whose input is a view from the front: the object's
+        front_fraction: Fraction of the samples whose input is a view from the front: the object's
             first, or another one at -35 to 35 degrees of azimuth and 0 to 20 of elevation. The
             other samples take any view.
-        mirror: Fraction of the samples whose object is mirrored, with its cameras.
-        recolor: Fraction of the samples whose colour channels are permuted and change gamma.
+        flip: Fraction of the samples whose object is mirrored, with its cameras.
+        color_jitter: Fraction of the samples whose colour channels are permuted and change gamma.
         procedural: Fraction of the samples that show procedural objects (gamba data procedural),
             which other processes make and render during the training; the others are of the
             datasets.
@@ -81,9 +81,9 @@ class DataConfig:
     views_per_object: Annotated[int, Meta(ge=0, le=1000)] | None = None
     background: Literal["white", "black", "random"] = "white"
     extra: tuple[Path, ...] = ()
-    front_share: Annotated[float, Meta(ge=0, le=1)] = 0.0
-    mirror: Annotated[float, Meta(ge=0, le=1)] = 0.0
-    recolor: Annotated[float, Meta(ge=0, le=1)] = 0.0
+    front_fraction: Annotated[float, Meta(ge=0, le=1)] = 0.0
+    flip: Annotated[float, Meta(ge=0, le=1)] = 0.0
+    color_jitter: Annotated[float, Meta(ge=0, le=1)] = 0.0
     procedural: Annotated[float, Meta(ge=0, le=1)] = 0.0
     cache: bool = False
     workers: Annotated[int, Meta(ge=1, le=1024)] | None = None
@@ -139,7 +139,7 @@ class OptimConfig:
         lr: Peak learning rate; after a warm-up it falls to 0 according to --schedule.
         schedule: "cosine" falls along half a cosine from the end of the warm-up; "trapezoid" stays
             at the peak and falls linearly at the end, so runs of different lengths begin alike.
-        decay_share: Fraction of the run in which "trapezoid" falls.
+        decay_fraction: Fraction of the run in which "trapezoid" falls.
         warmup_steps: Steps of the linear warm-up, a tenth of the run at most.
         ema: Decay of the weights' running average, shorter at the start; 0 turns it off.
         precision: Precision of the products in the network, by autocast; parameters, losses and
@@ -149,7 +149,7 @@ class OptimConfig:
 
     lr: Annotated[float, Meta(gt=0, le=10)] = 1e-3
     schedule: str = "cosine"
-    decay_share: Annotated[float, Meta(gt=0, le=1)] = 0.2
+    decay_fraction: Annotated[float, Meta(gt=0, le=1)] = 0.2
     warmup_steps: _Every = 100
     ema: Annotated[float, Meta(ge=0, lt=1)] = 0.999
     precision: Precision = "float32"
@@ -184,8 +184,8 @@ class RunConfig:
             loses no more.
         device: Device to train on; "auto" is the GPU if there is one.
         threads: Number of CPU threads; all cores if not given.
-        recompute: Keep only the blocks' inputs and recompute each block in the backward pass: the
-            same result in less memory and more time.
+        activation_checkpointing: Keep only the blocks' inputs and recompute each block in the
+            backward pass: the same result in less memory and more time.
         graph: Replay the launches of a step as a CUDA graph: the same result without the launch
             overhead of the host. "auto" does so on a GPU, where a step can be captured.
         seed: Seed of the initial weights and of the order of the data.
@@ -204,7 +204,7 @@ class RunConfig:
     save_minutes: Minutes | None = None
     device: DeviceChoice = "auto"
     threads: Threads | None = None
-    recompute: bool = False
+    activation_checkpointing: bool = False
     graph: Literal["auto", "off"] = "auto"
     seed: Seed = 0
 

@@ -1,7 +1,7 @@
 """Training on one or several processes; ``torchrun -m gamba_warp.train ...`` sets the environment.
 
 If one process fails, all end, each with a one-line message: code that may fail on a single process
-runs inside ``World.together``, and gloo reports a lost process to those that wait for it.
+runs inside ``World.raise_on_all``, and gloo reports a lost process to those that wait for it.
 """
 
 from __future__ import annotations
@@ -85,14 +85,14 @@ class World:
             dist.all_gather_object(found, value)
         return found
 
-    def on_main(self, action: Callable[[], Result]) -> Result:
+    def broadcast_from_main(self, action: Callable[[], Result]) -> Result:
         """Run an action on the main process and broadcast its picklable result.
 
         Raises:
-            UserError: as ``together``.
+            UserError: as ``raise_on_all``.
         """
         result: list[Any] = [None]
-        with self.together():
+        with self.raise_on_all():
             if self.main:
                 result = [action()]
         if self.size > 1:
@@ -100,7 +100,7 @@ class World:
         return result[0]
 
     @contextmanager
-    def together(self) -> Iterator[None]:
+    def raise_on_all(self) -> Iterator[None]:
         """Raise on all processes if the body raises on one.
 
         The body must not communicate between processes.
@@ -139,7 +139,7 @@ class World:
         options: dict[str, Any] = {name: False, "process_group": group}
         return DistributedDataParallel(model, **options)
 
-    def agree(self, facts: Callable[[], Mapping[str, dict[str, object]]]) -> None:
+    def check_consistent(self, facts: Callable[[], Mapping[str, dict[str, object]]]) -> None:
         """Check that all processes have the same setup.
 
         Args:
@@ -152,7 +152,7 @@ class World:
         if self.size == 1:
             return
         mine: Mapping[str, dict[str, object]] = {}
-        with self.together():
+        with self.raise_on_all():
             mine = facts()
         (host, here), *others = self.gather((socket.gethostname(), mine))
         for rank, (name, there) in enumerate(others, 1):

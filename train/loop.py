@@ -50,11 +50,11 @@ def train(config: TrainConfig, world: World) -> int:
     on_gpu, notes = world.device.type == "cuda", []
     with RunFolder(run.out, world) as folder:
         # Data, model, optimizer: nothing is written until all checks have passed.
-        with world.together():
+        with world.raise_on_all():
             data = open_data(config)
             lpips, warning = open_lpips(config, world.device.type)
         setup = Setup(config, data, world)
-        world.agree(lambda: facts_of(setup, lpips is not None))
+        world.check_consistent(lambda: facts_of(setup, lpips is not None))
         checkpoint = folder.find_checkpoint(run.resume, notes.append)
         torch.manual_seed(run.seed)
         # TF32 applies to the network's products, forward and backward; geometry has none
@@ -62,9 +62,9 @@ def train(config: TrainConfig, world: World) -> int:
         if on_gpu:
             torch.set_float32_matmul_precision("high")
         initial = None
-        with world.together():
+        with world.raise_on_all():
             model = Gamba(config.model_config(), run.encoder_weights)
-            model.recompute = run.recompute
+            model.checkpointing = run.activation_checkpointing
             if run.init is not None and checkpoint is None and world.main:  # ``wrap`` sends it
                 initial = find_initial(run.init, notes.append)
                 load_weights(initial, model)
@@ -118,11 +118,11 @@ def train(config: TrainConfig, world: World) -> int:
                 due = new and run.val_every and state.step % run.val_every == 0
                 tuned = state.step == 0 and run.init is not None  # compared with its beginning
                 if run.val_every and (due or tuned or (over and not stop)):
-                    world.on_main(partial(validator.run, state, progress))
+                    world.broadcast_from_main(partial(validator.run, state, progress))
                 waits = run.save_minutes and state.elapsed - saved >= 60 * run.save_minutes
                 if stop or over or (new and (waits or state.step % run.save_every == 0)):
                     outcomes.read()
-                    world.on_main(partial(state.save, setup))
+                    world.broadcast_from_main(partial(state.save, setup))
                     saved = state.elapsed
                 if stop or over:
                     break

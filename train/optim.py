@@ -25,7 +25,7 @@ SCHEDULES: dict[str, Callable[[OptimConfig, float, float, float], float]] = {
         (step - warmup) / max(1e-12, total - warmup)
     ),
     "trapezoid": lambda optim, step, warmup, total: _clamped(
-        (total - step) / (optim.decay_share * total)
+        (total - step) / (optim.decay_fraction * total)
     ),
 }
 WEIGHT_DECAY = 0.05  # paper, §4.1
@@ -214,7 +214,7 @@ class Schedule:
         if not self.since.rises:  # the rest of the fall, to 0 at the new end
             fraction, left = self.since.fraction, (total - step) / (total - began)
             if self.optim.schedule == "trapezoid":
-                falls = min(self.optim.decay_share * total, total - began)
+                falls = min(self.optim.decay_fraction * total, total - began)
                 return fraction * _clamped((total - step) / falls)
             phase = math.acos(2 * fraction - 1) / math.pi
             return _half_cosine(1 - (1 - phase) * left)

@@ -56,7 +56,7 @@ class RunFolder(contextlib.ExitStack):
                 self.enter_context(only_process(self.path, "trains"))
             return find_checkpoint(self.path, resume, warn)
 
-        found = self.world.on_main(find)
+        found = self.world.broadcast_from_main(find)
         if resume != "auto":
             return found
         taken = -1 if found is None else step_of(found)
@@ -78,7 +78,7 @@ class RunFolder(contextlib.ExitStack):
         Raises:
             UserError: it cannot be written, or another process has begun to train here.
         """
-        with self.world.together():
+        with self.world.raise_on_all():
             if not self.world.main:
                 return NoLog()
             output_folder(self.path / "samples")

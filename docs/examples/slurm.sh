@@ -30,4 +30,4 @@ srun --kill-on-bad-exit=1 torchrun \
     --nnodes "$SLURM_NNODES" --nproc-per-node 8 --max-restarts 10 \
     --rdzv-id "$SLURM_JOB_ID" --rdzv-backend c10d --rdzv-endpoint "$first:$port" \
     -m gamba_warp.train "$data" --out "$run" --recipe paper \
-    --recompute --workers 8 "$@"
+    --activation-checkpointing --workers 8 "$@"

@@ -34,7 +34,7 @@ class StandIn(torch.nn.Module):
         return images.new_zeros(len(images), self.count, self.channels)
 
 
-def measure(config: GambaConfig, depth: int, recompute: bool) -> list[float]:
+def measure(config: GambaConfig, depth: int, checkpointing: bool) -> list[float]:
     """Operations forward and backward, and bytes kept for the gradient, of one object."""
     encoder = None
     if config.prepend and config.encoder != "none":
@@ -42,7 +42,7 @@ def measure(config: GambaConfig, depth: int, recompute: bool) -> list[float]:
         patch = 14 if config.encoder.startswith("vit") else 16
         encoder = StandIn(wide, (config.encoder_size // patch) ** 2)
     model = Gamba(replace(config, depth=depth), encoder=encoder)
-    model.recompute = recompute
+    model.checkpointing = checkpointing
     own = {parameter.data_ptr() for parameter in model.parameters()}
     kept: dict[int, int] = {}
 
@@ -70,11 +70,11 @@ def main() -> None:
     parser.add_argument("preset", choices=sorted(PRESETS))
     config = PRESETS[parser.parse_args().preset]
     print("one object, GFLOP forward, GFLOP backward, GB kept for the gradient:")
-    for name, recompute in (("all is kept", False), ("--recompute", True)):
-        one, two = (measure(config, depth, recompute) for depth in (1, 2))
+    for name, checkpointing in (("all is kept", False), ("--activation-checkpointing", True)):
+        one, two = (measure(config, depth, checkpointing) for depth in (1, 2))
         whole = [a + (config.depth - 1) * (b - a) for a, b in zip(one, two)]
         print(f"  {name:22}{whole[0] / 1e9:>9.1f}{whole[1] / 1e9:>9.1f}{whole[2] / 1e9:>9.2f}")
-        if not recompute:
+        if not checkpointing:
             print(f"  {'of it a block':22}{'':18}{(two[2] - one[2]) / 1e9:>9.2f}")
     encoder = None if config.encoder == "none" else StandIn(768, 1)
     parameters = sum(p.numel() for p in Gamba(config, encoder=encoder).parameters())

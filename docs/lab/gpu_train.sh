@@ -166,12 +166,12 @@ END
   default() { [[ $given == *" $1 "* ]] || words+=("$@"); }
   default --preset rays && default --init starter/rays.safetensors && default --minutes "$minutes"
   default --batch-size "${BATCH:-64}" && default --views-per-object 3 && default --schedule trapezoid
-  default --decay-share 0.5 && default --warmup-steps 30 && default --lr 1e-3 && default --ema 0.999
+  default --decay-fraction 0.5 && default --warmup-steps 30 && default --lr 1e-3 && default --ema 0.999
   default --no-radial-mask && default --depth-weight 0.5 && default --ssim-weight 0.3
   default --novel-weight 3 && default --mask-l1-weight 0.25 && default --translucency-weight 0.06
   default --lpips on && default --lpips-weight 0.3 && default --lpips-crop 64
-  default --background random && default --front-share 0.5 && default --mirror 0.5
-  default --recolor 0.3 && default --precision bfloat16 && default --cache && default --val-every 0
+  default --background random && default --front-fraction 0.5 && default --flip 0.5
+  default --color-jitter 0.3 && default --precision bfloat16 && default --cache && default --val-every 0
   default --save-every 100000 && default --save-minutes 2 && default --out "$pack/run"
   python3 -W ignore -m gamba_warp train "${order[0]}" "${extra[@]}" "${words[@]}" "$@" 2>&1 |
     tee "$out/lines.txt" || code=$?

@@ -16,7 +16,7 @@ from ..untrusted.ranges import ranged
 # LPIPS in the loss would take most of a short CPU run.
 _TRAINING = (
     "--preset rays --minutes 5 --lpips off --no-radial-mask --ssim-weight 0.2 --batch-size 4 "
-    "--views-per-object 3 --front-share 0.5 --mirror 0.5 --lr 2e-3 --warmup-steps 30 --cache"
+    "--views-per-object 3 --front-fraction 0.5 --flip 0.5 --lr 2e-3 --warmup-steps 30 --cache"
 )
 _MAKE = "make setup unpacks it in a checkout; elsewhere give the folder of one by --starter"
 

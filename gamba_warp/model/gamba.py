@@ -42,7 +42,7 @@ class Gamba(nn.Module):
     """Network from one posed image to Gaussians (paper §3.2, GambaFormer and decoder).
 
     Attributes:
-        recompute: keep only each block's input for the gradient, and recompute the block in the
+        checkpointing: keep only each block's input for the gradient, and recompute the block in the
             backward pass; takes less memory and a third more time.
     """
 
@@ -69,7 +69,7 @@ class Gamba(nn.Module):
             names = ", ".join(DECODERS)
             raise UserError(f"config: decoder is {config.decoder[:100]!r}, expected one of {names}")
         self.config = config
-        self.recompute = False
+        self.checkpointing = False
         self.encoder = None
         if config.prepend:
             self.encoder = encoder or build_encoder(config, encoder_weights)
@@ -156,10 +156,10 @@ class Gamba(nn.Module):
             tokens = tokens[:, self.tokens.foreground(images, background, background_margin)]
         count = len(self.blocks)
         states, plane_states = condition[:count], condition[count:]
-        tokens = self.norm(run_blocks(self.blocks, tokens, states, self.recompute))
+        tokens = self.norm(run_blocks(self.blocks, tokens, states, self.checkpointing))
         if self.planes is None:
             return self.decoder(tokens)
-        return self.decoder(tokens, self.planes(len(images), plane_states, self.recompute))
+        return self.decoder(tokens, self.planes(len(images), plane_states, self.checkpointing))
 
     def _forward_rays(
         self, rgba: Tensor, cameras: Cameras, condition: list[Any], foreground: Foreground
@@ -167,7 +167,7 @@ class Gamba(nn.Module):
         """Run ``forward`` for the decoder ``rays``."""
         pixels = self.tokens.pixels(rgba, cameras)
         tokens = self.tokens.of_patches(pixels, foreground)[None]
-        tokens = run_blocks(self.blocks, tokens, condition, self.recompute, foreground.packed)
+        tokens = run_blocks(self.blocks, tokens, condition, self.checkpointing, foreground.packed)
         tokens = self.norm(tokens)[0, foreground.positions]
         return self.decoder(tokens, pixels, foreground, rgba, cameras)
 

@@ -53,7 +53,7 @@ def test_a_mirrored_sample_keeps_its_views_and_its_background(data):
     views = {"background": "random"}
     plain, turned = (
         Batches(open_data(config), config, ALONE, lambda _: 2, None)
-        for config in (micro.options(data, data, views=views | {"mirror": m}) for m in (0.0, 1.0))
+        for config in (micro.options(data, data, views=views | {"flip": m}) for m in (0.0, 1.0))
     )
     for number in range(4):
         one, other = (take(each, number) for each in (plain, turned))

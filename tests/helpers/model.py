@@ -109,9 +109,9 @@ def assert_each_alone(model: Gamba, rgba: torch.Tensor, cameras: Cameras, cells)
 
 
 def assert_recomputed_alike(model: Gamba, images: torch.Tensor, cameras: Cameras) -> None:
-    """Assert that ``recompute`` does not change any gradient."""
+    """Assert that ``checkpointing`` does not change any gradient."""
     cotangent, grads = torch.randn(len(images), 36, 3), []
-    for model.recompute in (False, True):
+    for model.checkpointing in (False, True):
         model.zero_grad()
         (model(images, cameras).means * cotangent).sum().backward()
         grads.append({n: p.grad for n, p in model.named_parameters() if p.grad is not None})

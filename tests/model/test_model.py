@@ -75,8 +75,8 @@ def test_recomputation_changes_memory_alone():
     images, cameras = inputs(2, 32)
     cotangent = torch.randn(2, 256, 3)
 
-    def step(recompute: bool) -> tuple[int, dict[str, torch.Tensor]]:
-        model.recompute, kept = recompute, {}
+    def step(checkpointing: bool) -> tuple[int, dict[str, torch.Tensor]]:
+        model.checkpointing, kept = checkpointing, {}
 
         def pack(tensor):
             kept[tensor.untyped_storage().data_ptr()] = tensor.untyped_storage().nbytes()

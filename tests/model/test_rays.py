@@ -247,7 +247,7 @@ def test_an_empty_image_has_no_gaussians_and_may_stand_in_a_batch():
 def test_other_shapes_and_recompute(changes):
     model, (rgba, cameras) = trained(rays(**changes)), cut_outs()
     config, grads = model.config, []
-    for model.recompute in (False, True):
+    for model.checkpointing in (False, True):
         made = model(rgba, cameras)
         cells = max_pool2d(rgba[..., 3], config.patch_size // config.ray_cells) > 0
         assert made.num == cells.sum((1, 2)).max() * config.ray_layers

@@ -15,8 +15,8 @@ from gamba_warp.train.checkpoint import list_checkpoints
 pytestmark = pytest.mark.slow  # a process takes seconds to import torch
 
 STEPS = 4
-VIEWS = {"background": "random", "views_per_object": None, "mirror": 0.5, "recolor": 0.5}
-OPTIONS = ["--steps", STEPS, "--background", "random", "--mirror", 0.5, "--recolor", 0.5]
+VIEWS = {"background": "random", "views_per_object": None, "flip": 0.5, "color_jitter": 0.5}
+OPTIONS = ["--steps", STEPS, "--background", "random", "--flip", 0.5, "--color-jitter", 0.5]
 OPTIONS += ["--save-every", 1]
 
 

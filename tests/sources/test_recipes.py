@@ -128,9 +128,9 @@ def test_the_shipped_models_recipe():
     shipped = parse(*shlex.split(shipped))  # its losses are those of the recipe from the start
     assert config.loss == replace(shipped.loss, lpips_after=1500)
     for name in (
-        "front_share",
-        "mirror",
-        "recolor",
+        "front_fraction",
+        "flip",
+        "color_jitter",
         "procedural",
         "background",
         "views_per_object",

@@ -50,7 +50,7 @@ def test_colours_change_places_and_gamma_and_alpha_stays():
 
 def test_chances_are_kept_and_do_not_touch_each_other():
     drawn = [draw_change(np.random.default_rng([7, n]), 0.5, 0.25) for n in range(400)]
-    assert 160 < sum(change.mirror for change in drawn) < 240
+    assert 160 < sum(change.flip for change in drawn) < 240
     changed = [change for change in drawn if change.gamma != 1]
     assert 70 < len(changed) < 130
     assert all(1 / MAX_GAMMA <= change.gamma <= MAX_GAMMA for change in changed)
@@ -59,5 +59,5 @@ def test_chances_are_kept_and_do_not_touch_each_other():
     assert min(c.gamma for c in changed) < 0.7 and max(c.gamma for c in changed) > 1.43
     assert {change.channels for change in changed} >= {(0, 2, 1), (2, 1, 0)}
     plain = [draw_change(np.random.default_rng([7, n]), 0.5, 0.0) for n in range(400)]
-    assert [change.mirror for change in plain] == [change.mirror for change in drawn]
+    assert [change.flip for change in plain] == [change.flip for change in drawn]
     assert all(change.gamma == 1 for change in plain)

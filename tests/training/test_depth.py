@@ -152,7 +152,7 @@ def test_surfaces_of_a_sample_are_in_the_models_world(boxes):
     assert (scale - 1).abs() > 0.02
     true = (through_the_box(stored)[0] * scale).nan_to_num(0)
     assert (true - true.flip(-1)).abs().max() > 0.05
-    for change, want in ((None, true), (Change(mirror=True), true.flip(-1))):
+    for change, want in ((None, true), (Change(flip=True), true.flip(-1))):
         batch = load_sample(data, 0, [2, 0], 16, config, background, change, surfaces=True)
         assert batch.surfaces.shape == (1, 2, 16, 16)
         assert ((batch.surfaces[0] - want).abs() < 2e-3).float().mean() > 0.98  # but for boundaries

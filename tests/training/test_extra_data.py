@@ -70,7 +70,7 @@ def test_two_sets_of_one_name_are_refused(roots, tmp_path):
 
 @pytest.mark.parametrize("fraction", [0.0, 1.0])
 def test_inputs_are_from_the_front_as_often_as_told(roots, tmp_path, fraction):
-    options = micro.options(roots[0], tmp_path, views={"front_share": fraction, "batch_size": 1})
+    options = micro.options(roots[0], tmp_path, views={"front_fraction": fraction, "batch_size": 1})
     data = replace(open_data(options), objects=[0])
     dataset = data.train
     poses = dataset.files(0).camera_to_world

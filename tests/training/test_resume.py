@@ -100,6 +100,7 @@ def test_other_images_of_the_same_names_are_refused(data, done, tmp_path):
     del state["content"]
     views, length = state["config"]["views"], state["new_length"]  # with older names
     views["made"], length["share"] = views.pop("procedural"), length.pop("fraction")
+    views["mirror"], views["front_share"] = views.pop("flip"), views.pop("front_fraction")
     older = save_checkpoint(tmp_path / "older", 8, {}, state, keep=1)
     for name in ("model", "ema"):
         shutil.copy(last / f"{name}.safetensors", older)

@@ -103,7 +103,7 @@ def test_recomputation_changes_no_bit(data, tmp_path, monkeypatch):
         return checkpoint(*arguments, **options)
 
     monkeypatch.setattr("gamba_warp.model.parts.block.checkpoint", counting)
-    assert run(data, tmp_path / "lean", run={"recompute": True}) == 0
+    assert run(data, tmp_path / "lean", run={"activation_checkpointing": True}) == 0
     assert len(calls) == 6  # one block, six steps; none in validation
     assert_same_files(tmp_path / "plain/model.safetensors", tmp_path / "lean/model.safetensors")
 

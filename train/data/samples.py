@@ -25,18 +25,18 @@ class Change:
     """Augmentation of the views of one sample.
 
     Attributes:
-        mirror: exchange left and right.
+        flip: exchange left and right.
         channels: order of the colour channels.
         gamma: exponent of the colours, > 0.
     """
 
-    mirror: bool = False
+    flip: bool = False
     channels: tuple[int, int, int] = (0, 1, 2)
     gamma: float = 1.0
 
     def __call__(self, views: ObjectViews) -> ObjectViews:
         """Return the changed views."""
-        if self.mirror:
+        if self.flip:
             views = mirrored(views)
         if self.channels == (0, 1, 2) and self.gamma == 1.0:
             return views  # the most frequent case
@@ -45,21 +45,21 @@ class Change:
         return replace(views, images=images)
 
 
-def draw_change(rng: np.random.Generator, mirror: float, recolor: float) -> Change:
+def draw_change(rng: np.random.Generator, flip: float, color_jitter: float) -> Change:
     """Draw a change.
 
     Args:
         rng: random generator.
-        mirror: probability that the object is mirrored.
-        recolor: probability that its colours change.
+        flip: probability that the object is mirrored.
+        color_jitter: probability that its colours change.
     """
     # Always the same number of draws, so that one option does not affect the other.
     first, second, power = rng.random(3)
     order = rng.permutation(3)
-    if second >= recolor:
-        return Change(bool(first < mirror))
+    if second >= color_jitter:
+        return Change(bool(first < flip))
     channels = (int(order[0]), int(order[1]), int(order[2]))
-    return Change(bool(first < mirror), channels, float(MAX_GAMMA ** (2 * power - 1)))
+    return Change(bool(first < flip), channels, float(MAX_GAMMA ** (2 * power - 1)))
 
 
 def mirrored(views: ObjectViews) -> ObjectViews:

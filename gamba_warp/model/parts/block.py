@@ -118,7 +118,7 @@ def run_blocks(
     blocks: Iterable[nn.Module],
     tokens: Tensor,
     states: Sequence[Any],
-    recompute: bool = False,
+    checkpointing: bool = False,
     packed: Packed | None = None,
 ) -> Tensor:
     """Run all blocks over the 3DGS tokens.
@@ -131,7 +131,7 @@ def run_blocks(
         blocks: the network's blocks, all of one kind, in their order.
         tokens: ``[B, L, width]``; with ``packed`` ``[1, T, width]``, all images' tokens.
         states: the result of ``prefix_states``, one entry per block.
-        recompute: with gradients, keep only each block's input and recompute the block in the
+        checkpointing: with gradients, keep only each block's input and recompute the block in the
             backward pass.
         packed: each image's tokens in one row.
 
@@ -151,7 +151,7 @@ def run_blocks(
         start += segment.shape[1]
         for i, block in enumerate(blocks):
             run = block
-            if recompute and gradients:
+            if checkpointing and gradients:
                 run = partial(checkpoint, block, use_reentrant=False)
             segment, states[i] = run(segment, states[i], own, keep)
         segments[s] = segment

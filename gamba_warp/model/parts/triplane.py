@@ -40,16 +40,16 @@ class PlaneBranch(nn.Module):
         nn.init.normal_(self.features.weight, std=config.width**-0.5)
         nn.init.zeros_(self.features.bias)
 
-    def forward(self, batch: int, states: Sequence[Any], recompute: bool = False) -> Tensor:
+    def forward(self, batch: int, states: Sequence[Any], checkpointing: bool = False) -> Tensor:
         """Make the planes of ``batch`` images: ``[B, 3, features, n, n]``.
 
         Args:
             batch: B.
             states: of ``blocks``, after the prefix of these images.
-            recompute: as for ``run_blocks``.
+            checkpointing: as for ``run_blocks``.
         """
         tokens = self.embedding.expand(batch, -1, -1)
-        tokens = run_blocks(self.blocks, tokens, states, recompute)
+        tokens = run_blocks(self.blocks, tokens, states, checkpointing)
         return self.features(self.norm(tokens)).unflatten(1, self.sides).permute(0, 1, 4, 2, 3)
 
 

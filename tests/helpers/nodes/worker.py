@@ -32,7 +32,7 @@ def main() -> None:
             checkpoint.read_run = None
         for name, arguments, limits in json.loads(plan.read_text()):
             if name == "copy":
-                with place.together():
+                with place.raise_on_all():
                     if place.main:
                         shutil.copytree(arguments, limits)
                 continue

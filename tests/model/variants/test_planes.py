@@ -138,7 +138,7 @@ def test_recomputation_and_dropped_background_change_no_colour():
     model = Gamba(micro(encoder="none", **PLANES))
     images, cameras = inputs(1)
     cotangent, grads = torch.randn(1, 36, 3), []
-    for model.recompute in (False, True):
+    for model.checkpointing in (False, True):
         model.zero_grad()
         (model(images, cameras).colors * cotangent).sum().backward()
         grads.append(model.planes.embedding.grad.clone())
