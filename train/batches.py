@@ -371,7 +371,7 @@ class Batches:
             seed=self.config.run.seed,
             depth=self.config.loss.depth_weight > 0,
             fronts=MADE_VIEWS // 3,
-            light="varied",
+            light="randomized",
             up="y",
             **VARIED_CAMERAS,
         )

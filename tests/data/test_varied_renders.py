@@ -61,9 +61,10 @@ def test_without_the_new_options_nothing_changes_and_older_sets_go_on(boxes, tmp
     values = json.loads(path.read_text())
     for name in ("fronts", "spread", "stretch", "fov_spread", "light"):
         del values["settings"][name]
-    path.write_text(json.dumps(values))
-    assert render_views(boxes, out, **QUICK) == 0
-    assert "2 of 2 objects already in" in capsys.readouterr().out
+    for older in ({}, {"light": "usual"}):
+        path.write_text(json.dumps(values | {"settings": values["settings"] | older}))
+        assert render_views(boxes, out, **QUICK) == 0
+        assert "2 of 2 objects already in" in capsys.readouterr().out
     refused("rendered with other settings", render_views, boxes, out, stretch=1.2, **QUICK)
 
 

@@ -23,8 +23,8 @@ GLOSS = 0.02  # fraction reflected even by a black surface, so that its shape sh
 OPAQUE = 0.02  # transmittance below which a ray ends
 # Ranges of the lights of an object: height of the key light in degrees, its strength, that of the
 # ambient light, and the tint of both lights.
-USUAL = {"height": (25, 70), "key": (0.5, 0.85), "ambient": (0.4, 0.6), "tint": (0.92, 1.0)}
-VARIED = {"height": (0, 90), "key": (0.3, 1.1), "ambient": (0.2, 0.7), "tint": (0.75, 1.0)}
+DEFAULT = {"height": (25, 70), "key": (0.5, 0.85), "ambient": (0.4, 0.6), "tint": (0.92, 1.0)}
+RANDOMIZED = {"height": (0, 90), "key": (0.3, 1.1), "ambient": (0.2, 0.7), "tint": (0.75, 1.0)}
 
 
 @dataclass
@@ -44,14 +44,14 @@ class Lights:
     head: float
 
     @classmethod
-    def sample(cls, rng: np.random.Generator, varied: bool = False) -> "Lights":
+    def sample(cls, rng: np.random.Generator, randomized: bool = False) -> "Lights":
         """Draw a key light and a fill light from above, ambient light and a lamp at the camera.
 
         Args:
             rng: random generator.
-            varied: draw strength, height and tint of the lights from wider ranges.
+            randomized: draw strength, height and tint of the lights from wider ranges.
         """
-        ranges = VARIED if varied else USUAL
+        ranges = RANDOMIZED if randomized else DEFAULT
         azimuth = rng.uniform(0, 2 * math.pi) + np.array([0, rng.uniform(0.5, 1.5) * math.pi])
         height = np.sin(np.radians([rng.uniform(*ranges["height"]), rng.uniform(0, 50)]))
         flat = np.sqrt(1 - height**2)

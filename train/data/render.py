@@ -84,7 +84,7 @@ def draw_views(
     stretch, fov = settings.drawn(np.random.default_rng(int.from_bytes(digest[8:16], "big")))
     turn = np.diag(stretch) @ (np.eye(3) if rotation is None else np.asarray(rotation))
     model, transform, scale = model.normalized(settings.up, turn)
-    caster = RayCaster(model, Lights.sample(rng, settings.light == "varied"))
+    caster = RayCaster(model, Lights.sample(rng, settings.light == "randomized"))
     used = model.vertices[np.unique(model.faces)]
     if settings.poses == "gso":
         poses = ring_poses(used, fov, gso.ELEVATIONS, gso.AZIMUTHS)[: settings.views]
@@ -181,7 +181,8 @@ def still_missing(
         except UserError as error:
             damaged[mesh.uid] = f"{error}; remove {path.parent} to render it again"
             continue
-        if stored is None or _DEFAULTS | stored != vars(settings):
+        light = _OLDER_LIGHTS.get((stored or {}).get("light"))
+        if stored is None or _DEFAULTS | stored | (light or {}) != vars(settings):
             raise UserError(
                 f"{path}: was rendered with other settings ({stored}); choose another --out"
             )
@@ -190,6 +191,11 @@ def still_missing(
 
 # Defaults of settings that older datasets do not name.
 _DEFAULTS = {f.name: f.default for f in fields(Settings) if f.default is not MISSING}
+# Earlier names of the lights.
+_OLDER_LIGHTS: dict[Any, dict[str, str]] = {
+    "usual": {"light": "default"},
+    "varied": {"light": "randomized"},
+}
 
 
 class _Stored(msgspec.Struct):

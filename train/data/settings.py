@@ -35,7 +35,7 @@ class Settings:
         spread: Largest fraction by which a camera stands further away than necessary.
         stretch: Stretch each object along each axis by a factor between 1 / STRETCH and STRETCH.
         fov_spread: Draw each object's field of view between FOV / FOV_SPREAD and FOV * FOV_SPREAD.
-        light: varied makes the lights of the objects differ more.
+        light: randomized makes the lights of the objects differ more.
         poses: "drawn", or "gso": that evaluation's poses, the input view first.
     """
 
@@ -50,7 +50,7 @@ class Settings:
     spread: Annotated[float, Meta(ge=0, le=10)] = SPREAD
     stretch: Annotated[float, Meta(ge=1, le=10)] = 1.0
     fov_spread: Annotated[float, Meta(ge=1, le=4)] = 1.0
-    light: Literal["usual", "varied"] = "usual"
+    light: Literal["default", "randomized"] = "default"
     poses: tyro.conf.Suppress[Literal["drawn", "gso"]] = "drawn"
 
     def drawn(self, rng: np.random.Generator) -> tuple[np.ndarray, float]:
