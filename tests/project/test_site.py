@@ -2,7 +2,6 @@
 
 import os
 import re
-import subprocess
 import sys
 from html.parser import HTMLParser
 from pathlib import Path
@@ -71,28 +70,6 @@ def test_a_page_loads_nothing_from_elsewhere(site):
         assert not outside, f"{page}: {outside}"
 
 
-def test_the_command_that_make_docs_prints_serves_the_site_with_its_search(site, browser_page):
-    makefile = (ROOT / "Makefile").read_text(encoding="utf-8")
-    words = re.search(r'@echo "[^"]*: \$\(BIN\)/python (-m http\.server [^"]*)"', makefile)[1]
-    words = words.replace("--directory site", f"--directory {site}")
-    command = [sys.executable, "-u", *words.split(), "0"]
-    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as server:
-        try:
-            page = browser_page(re.search(r"http://\S+/", server.stdout.readline())[0], 1300).page
-
-            search = page.locator("[data-md-component=search-query]")
-            search.fill("turntable")
-
-            def found():  # the page reads what is typed as a key goes up
-                search.press("End")
-                page.wait_for_timeout(1000)
-                return page.query_selector(".md-search-result__item a")
-
-            assert any(found() for _ in range(60))
-        finally:
-            server.kill()
-
-
 def test_links_keep_their_anchors_and_blocks_of_code_are_left():
     text = "[a](../eval/README.md#b) [c](#d) [e](https://f.org/g.md)\n"
     block = f"```text\n{text}```\n"
@@ -109,21 +86,6 @@ def test_the_readme_is_short_and_its_links_lead_somewhere():
     assert image.stat().st_size < 1.5e6
     for path in targets(README, "README.md"):
         assert (ROOT / path).exists(), path
-
-
-def test_each_mark_beside_others_has_its_proof():
-    text = (ROOT / "docs" / "index.md").read_text(encoding="utf-8")
-    page = text.partition("## Similar projects")[2]
-    lines = [line for line in page.split("\n") if line.startswith("| ")]
-    named = dict(re.findall(r"^\[(\w+)\]: (https://\S+)$", page, re.MULTILINE))
-    assert len(lines) > 8
-    for line in lines[2:]:
-        title, *cells = line.strip("| ").split(" | ")
-        assert len(cells) == 6, title
-        for cell in cells:
-            links = re.findall(r"\]\(([^)]+)\)", cell)
-            links += [named[name] for name in re.findall(r"\]\[(\w+)\]", cell)]
-            assert links, f"{title}: {cell}"
 
 
 def test_the_citation_is_that_of_the_paper():

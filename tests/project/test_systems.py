@@ -1,7 +1,6 @@
-"""Features that macOS lacks, taken away on the machine of the tests, and text encodings."""
+"""Features that macOS lacks, taken away on the machine of the tests; imports, versions and CI."""
 
-import ast
-import configparser
+import importlib.metadata
 import os
 import re
 import sys
@@ -17,15 +16,10 @@ from gamba_warp.files import only_process, write_json
 from gamba_warp.kernels.runtime import launch, memory, system
 from gamba_warp.kernels.selective_scan import selective_scan
 from gamba_warp.untrusted import children
+from gamba_warp.versions import installed
 from gamba_warp.vision.weights import cache_folder, store_weights
 
 ROOT = Path(__file__).resolve().parents[2]
-FOLDERS = {
-    "gamba_warp": "gamba_warp",
-    "kernels": "gamba_warp.kernels",
-    "train": "gamba_warp.train",
-    "eval": "gamba_warp.eval",
-}
 
 
 def test_json_ends_its_lines_alike_everywhere(tmp_path):
@@ -104,48 +98,25 @@ def test_a_lock_that_is_a_link_is_not_followed(tmp_path):
     assert (tmp_path / "target").read_bytes() == b"precious"
 
 
-def _text_without_encoding(path: Path) -> list[int]:
-    """Lines that open text in an encoding that differs between systems."""
-    lines = []
-    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
-        if not isinstance(node, ast.Call):
-            continue
-        name = ast.unparse(node.func).rpartition(".")[2]
-        given = {keyword.arg for keyword in node.keywords}
-        if name in ("run", "Popen") and {"text", "universal_newlines"} & given - {"encoding"}:
-            lines += [] if "encoding" in given else [node.lineno]
-        method = isinstance(node.func, ast.Attribute)
-        if name in ("open", "fdopen") and ast.unparse(node.func) in ("open", "os.fdopen"):
-            mode = ast.unparse(node.args[1]) if len(node.args) > 1 else ""
-            lines += [] if "b" in mode or {"encoding", None} & given else [node.lineno]
-        if method and name in ("read_text", "write_text") and "encoding" not in given:
-            lines.append(node.lineno)
-    return lines
-
-
-def test_text_has_an_encoding(tmp_path):
-    wrong = 'open("a")\nopen("a", "rb")\np.read_text()\np.write_text(x)\nrun(a, text=True)\n'
-    (tmp_path / "a.py").write_text(wrong, encoding="utf-8")
-    assert _text_without_encoding(tmp_path / "a.py") == [1, 3, 4, 5]
-    files = [path for folder in FOLDERS for path in (ROOT / folder).rglob("*.py")]
-    found = {path: _text_without_encoding(path) for path in files}
-    assert not {path: lines for path, lines in found.items() if lines}
-
-
-def test_every_package_is_listed():
-    config = configparser.ConfigParser()
-    config.read(ROOT / "setup.cfg")
-    folders = {
-        ".".join((package, *path.parent.relative_to(ROOT / folder).parts))
-        for folder, package in FOLDERS.items()
-        for path in (ROOT / folder).rglob("*.py")
-    }
-    # The shipped model: files, and no code.
-    assert set(config["options"]["packages"].split()) == folders | {"gamba_warp.starter"}
-
-
 def test_modules_are_not_imported_by_their_folders_names():
     by_folder = re.compile(r"^ *(from|import) (kernels|train|eval)\b", re.M)
-    for folder in (*FOLDERS, "tests", "docs"):
+    for folder in ("gamba_warp", "kernels", "train", "eval", "tests", "docs"):
         for path in (ROOT / folder).rglob("*.py"):
             assert not by_folder.search(path.read_text(encoding="utf-8")), path
+
+
+def test_only_installed_packages_have_a_version():
+    found = installed("torch", "no-such-package", "numpy")
+    assert found["numpy"] == importlib.metadata.version("numpy")
+    # the local part of a version, such as +cu132, need not be in what pip notes
+    assert list(found) == ["torch", "numpy"] and torch.__version__.startswith(found["torch"])
+
+
+def test_the_continuous_integration_trusts_no_tag_and_may_only_read():
+    for path in sorted((ROOT / ".github" / "workflows").glob("*.yml")):
+        text = path.read_text()
+        actions = re.findall(r"uses: *(.*)", text)
+        assert actions and "\npermissions:\n  contents: read\n" in text, path
+        assert text.count("permissions:") == 1 and "persist-credentials: false" in text, path
+        for action in actions:
+            assert re.fullmatch(r"\S+@[0-9a-f]{40} # v\d+\.\d+\.\d+", action), action

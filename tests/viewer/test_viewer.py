@@ -400,12 +400,12 @@ def test_a_dropped_mesh_is_shown_as_gamba_view_shows_it(viewer, tmp_path, kind):
     assert "4 faces" in opened.page.inner_text("#about") and not opened.messages
 
 
-def glb(nodes=({"mesh": 0},), attributes=(), primitive=(), material=(), **top):
+def glb(nodes=None, attributes=(), primitive=(), material=(), **top):
     """A .glb of a triangle with something else in it."""
     floats = np.eye(3, dtype="<f4").tobytes()
     triangle = {"attributes": {"POSITION": 0, **dict(attributes)}, "material": 0, **dict(primitive)}
     tree = {
-        "nodes": list(nodes),
+        "nodes": list(nodes or [{"mesh": 0}]),
         "meshes": [{"primitives": [triangle]}],
         "materials": [dict(material)],
         "accessors": [{"componentType": 5126, "type": "VEC3", "count": 3, "bufferView": 0}],
