@@ -7,13 +7,12 @@ from helpers.raster import NAMES, leaves, make
 
 from gamba_warp.kernels.rasterize import Skip, autograd, projection, rasterization
 from gamba_warp.kernels.rasterize.cpu import bin as bin_cpu
-from gamba_warp.kernels.rasterize.cpu import composite as composite_cpu
 from gamba_warp.kernels.rasterize.cpu.project import project_on_lanes, vjp_on_lanes
 from gamba_warp.kernels.rasterize.cuda import bin as bin_cuda
 from gamba_warp.kernels.rasterize.cuda.project import project_on_threads, vjp_on_threads
 from gamba_warp.kernels.rasterize.projection import Projected, ProjectionOptions, projection_params
 from gamba_warp.kernels.rasterize.skip import TILE_TEST
-from gamba_warp.kernels.rasterize.tiles import Splats2D, Tiling, make_grid
+from gamba_warp.kernels.rasterize.tiles import Tiling, make_grid
 
 LISTS = ("pairs", "starts")
 
@@ -103,18 +102,6 @@ def test_lists_are_in_order_of_depth_then_of_index(monkeypatch):
     assert (key.diff() == 0)[same].float().mean() > 0.5
 
 
-def test_pairs_are_numbered_by_gaussian(monkeypatch):
-    """The rows of a Gaussian are adjacent, from its offset on; the sums of rows rely on that."""
-    monkeypatch.setattr(bin_cpu, "MANY", 0)
-    bins = rasterization(**make(2, 2, 150, 50, 70))[2].bins
-    total = len(bins.pairs)
-    assert torch.equal(bins.rows.sort().values, torch.arange(total, dtype=torch.int32))
-    owners = torch.empty_like(bins.pairs)
-    owners[bins.rows.long()] = bins.pairs
-    assert torch.equal(owners, bins.order.repeat_interleave(bins.offsets.diff()))
-    assert bins.offsets[0] == 0 and bins.offsets[-1] == total
-
-
 @pytest.mark.parametrize("many", [0, 1 << 30])
 def test_repeatable_with_any_number_of_threads(monkeypatch, many):
     monkeypatch.setattr(bin_cpu, "MANY", many)
@@ -188,34 +175,6 @@ def test_projection_of_covariances_and_of_the_original_on_lanes(shape, original,
     alone = [True, *[False] * 5]
     for run in (vjp_on_lanes, vjp_on_threads):
         assert torch.equal(projection.project_backward(*kept[:-1], alone, run)[0], of_lanes[0])
-
-
-def sums_one_by_one(v_pairs, written, splats, bins, geometry, absolute):
-    """Row after row in float32, and README eq. 11 with every product rounded."""
-    _, conics, view_opacities, _ = splats
-    sums = torch.zeros(bins.order.numel(), v_pairs.shape[1])
-    firsts = bins.offsets.tolist()
-    for i, begin, end in zip(bins.order.tolist(), firsts, firsts[1:]):
-        for p in range(begin, end):
-            if written[p]:
-                sums[i] += v_pairs[p]
-    sums = sums.view(*view_opacities.shape, -1)
-    h, hu, hy, huu, huy, hyy = sums[..., :6].unbind(-1)
-    a, k, e = conics.unbind(-1)
-    v_means2d = torch.stack([a * hu, a * k * hu + e * hy], -1)
-    v_conics = torch.stack([-0.5 * huu, -a * huy, -0.5 * hyy], -1)
-    v_opacities = torch.where(h != 0, h / view_opacities, 0.0)
-    assert geometry and absolute is None
-    return Splats2D(v_means2d, v_conics, v_opacities, sums[..., 6:].contiguous())
-
-
-@pytest.mark.parametrize("channels", [1, 3, 10, 11, 20])
-def test_sums_of_rows(monkeypatch, channels):
-    """To the bit, for rows that are lanes (to ten channels) and for wider ones."""
-    scene = make(1, 2, 150, 50, 70, channels=channels)
-    got = call(scene)
-    monkeypatch.setattr(composite_cpu, "reduce_rows", sums_one_by_one)
-    assert_same(call(scene), got)
 
 
 @pytest.mark.parametrize("mode", ["classic", "antialiased"])

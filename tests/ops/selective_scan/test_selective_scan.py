@@ -60,6 +60,24 @@ def test_without_options():
     compare(inputs, delta_softplus=False)
 
 
+@pytest.mark.parametrize("device", ["cpu", "ptx"])
+@pytest.mark.parametrize(
+    "length, delta, bias", [*((n, 0, 3.0) for n in (15, 17, 63, 65, 130)), (200, 40, 0.0)]
+)
+def test_public_reports(length, delta, bias, device, from_ptx):
+    """Issues 368 and 880 of mamba-ssm do not happen here.
+
+    Behind the last token a step is not 0 once bias and softplus have been applied. With steps of
+    40 and A down to -16, sums of δA over a chunk pass the exponent's range, in both signs.
+    """
+    inputs = make(1, length, 5, 3)
+    inputs["delta"] += delta
+    inputs["delta_bias"] = torch.full((5,), bias) if bias else inputs["delta_bias"]
+    if device == "ptx":
+        from_ptx()
+    compare(inputs)
+
+
 @pytest.mark.parametrize(
     "dtype, of_delta, limit",
     [
