@@ -296,20 +296,6 @@ def test_what_is_no_profile_is_said_and_keeps_the_pixels(tmp_path, mode, profile
     np.testing.assert_array_equal(got, want)
 
 
-def test_without_littlecms_the_pixels_stay(tmp_path, monkeypatch):
-    from PIL import ImageCms
-
-    def missing(*_):
-        raise ImportError("no littleCMS")
-
-    monkeypatch.setattr(ImageCms, "ImageCmsProfile", missing)
-    colours().save(tmp_path / "a.png", icc_profile=colour_profile(ADOBE_RGB, 2.1))
-    said = []
-    got = load_rgba(tmp_path / "a.png", warn=said.append)
-    np.testing.assert_array_equal(got[..., :3], np.asarray(colours()) / np.float32(255))
-    assert len(said) == 1 and "a.png" in said[0] and "no littleCMS" in said[0]
-
-
 def test_float_tiff_is_scaled_and_stays_finite(tmp_path):
     values = np.array([[0.0, 0.5, np.nan], [4.0, np.inf, -1.0]], np.float32)
     Image.fromarray(values).save(tmp_path / "a.tiff")
