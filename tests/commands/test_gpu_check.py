@@ -49,12 +49,6 @@ def test_torch_warp_and_pytest_are_enough(tmp_path):
     assert "| default | B 1, L 1024, D 256, taps 4 | forward |" in (out / "bench.md").read_text()
 
 
-def test_all_tests_of_the_kernels_are_found():
-    names = {path.name for path in gpu_check.test_files()}
-    assert {"test_gpu.py", "test_machine.py", "test_rasterize_cuda.py"} <= names
-    assert "test_doctor.py" not in names
-
-
 @pytest.mark.parametrize(
     "arguments, reason",
     [([], "no CUDA device"), (["--device", "cpu", "--minutes", "0"], "--minutes 0.0")],

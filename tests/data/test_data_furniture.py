@@ -59,7 +59,7 @@ def write_deb(folder, files):
     (package / "DEBIAN").mkdir(parents=True)
     text = "Package: p\nVersion: 1\nArchitecture: all\nMaintainer: m\nDescription: d\n"
     (package / "DEBIAN" / "control").write_text(text)
-    place = package / "usr/fraction/sweethome3d/furniture"
+    place = package / "usr/share/sweethome3d/furniture"
     place.mkdir(parents=True)
     for name, data in files.items():
         (place / name).write_bytes(data)
