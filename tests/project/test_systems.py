@@ -1,6 +1,5 @@
 """Features that macOS lacks, taken away on the machine of the tests; imports, versions and CI."""
 
-import importlib.metadata
 import os
 import re
 import sys
@@ -11,20 +10,15 @@ import torch
 import warp as wp
 from helpers.refusals import refused
 
+from gamba_warp import devices
 from gamba_warp.errors import UserError
-from gamba_warp.files import only_process, write_json
+from gamba_warp.files import only_process
 from gamba_warp.kernels.runtime import launch, memory, system
 from gamba_warp.kernels.selective_scan import selective_scan
 from gamba_warp.untrusted import children
-from gamba_warp.versions import installed
 from gamba_warp.vision.weights import cache_folder, store_weights
 
 ROOT = Path(__file__).resolve().parents[2]
-
-
-def test_json_ends_its_lines_alike_everywhere(tmp_path):
-    write_json(tmp_path / "a.json", ["ä"])
-    assert (tmp_path / "a.json").read_bytes() == b'[\n  "\\u00e4"\n]\n'
 
 
 wp.init()  # its libraries are found before ctypes is patched
@@ -105,13 +99,6 @@ def test_modules_are_not_imported_by_their_folders_names():
             assert not by_folder.search(path.read_text(encoding="utf-8")), path
 
 
-def test_only_installed_packages_have_a_version():
-    found = installed("torch", "no-such-package", "numpy")
-    assert found["numpy"] == importlib.metadata.version("numpy")
-    # the local part of a version, such as +cu132, need not be in what pip notes
-    assert list(found) == ["torch", "numpy"] and torch.__version__.startswith(found["torch"])
-
-
 def test_the_continuous_integration_trusts_no_tag_and_may_only_read():
     for path in sorted((ROOT / ".github" / "workflows").glob("*.yml")):
         text = path.read_text()
@@ -120,3 +107,33 @@ def test_the_continuous_integration_trusts_no_tag_and_may_only_read():
         assert text.count("permissions:") == 1 and "persist-credentials: false" in text, path
         for action in actions:
             assert re.fullmatch(r"\S+@[0-9a-f]{40} # v\d+\.\d+\.\d+", action), action
+
+
+@pytest.mark.parametrize(
+    ("load", "chosen", "want"),
+    [
+        (1.5, {}, "1000"),
+        (0.2, {}, None),
+        (1.5, {"GOMP_SPINCOUNT": "77"}, "77"),
+        (1.5, {"OMP_WAIT_POLICY": "active"}, None),
+    ],
+)
+def test_threads_sleep_where_the_cores_are_busy(monkeypatch, load, chosen, want):
+    for name in ("GOMP_SPINCOUNT", "OMP_WAIT_POLICY"):
+        monkeypatch.setenv(name, "x")  # so that it is as before in the end, whatever is set
+        monkeypatch.delenv(name)
+    for name, value in chosen.items():
+        monkeypatch.setenv(name, value)
+    monkeypatch.delitem(sys.modules, "torch")
+    monkeypatch.setattr(os, "getloadavg", lambda: (load, 0.0, 0.0), raising=False)
+    monkeypatch.setattr(devices, "cores", lambda: 2)
+    devices.share_cores()
+    assert os.environ.get("GOMP_SPINCOUNT") == want
+
+
+def test_what_torch_has_read_already_is_not_changed(monkeypatch):
+    monkeypatch.delenv("GOMP_SPINCOUNT", raising=False)
+    monkeypatch.setattr(os, "getloadavg", lambda: (99.0, 0.0, 0.0), raising=False)
+    assert "torch" in sys.modules or __import__("torch")
+    devices.share_cores()
+    assert "GOMP_SPINCOUNT" not in os.environ
