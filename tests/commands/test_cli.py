@@ -219,20 +219,6 @@ def test_help_shows_no_missing_default(name):
     assert "none" in text.split("--mesh ")[1].split("}")[0] if name == "reconstruct" else True
 
 
-@pytest.mark.parametrize("name", cli.COMMANDS)
-def test_lines_of_help_are_filled(name):
-    """tyro ends a line early before words of a docstring's next line that begin with no letter."""
-    lines = cli.help_text(name, cli.load_command(name), []).splitlines()
-    for line, after in zip(lines, lines[1:]):
-        same = re.match(" {10,}", line), re.match(" {10,}", after)
-        if all(same) and same[0][0] == same[1][0]:
-            assert len(line) + 1 + len(after.split()[0]) > 78, (line, after)
-
-
-def test_every_command_has_one_line_of_help():
-    assert all(row.about.endswith(".") and len(row.about) < 60 for row in cli.COMMANDS.values())
-
-
 # Ctrl-C while ``gamba train`` opens its data; in the loop it saves and stops, see test_train.py.
 CTRL_C = """
 import os, runpy, signal, sys

@@ -18,9 +18,7 @@ VIEWS = {
     "table": [row("model", 20.5), row("retrieval", 99.0), row("billboard", 17.0)]
     + [row("model", 38.0, "input")],
 }
-SHAPES = {
-    "mean": {"chamfer": 0.04321, "normal_consistency": 0.7, "iou": 0.5},
-}
+SHAPES = {"mean": {"chamfer": 0.04321, "normal_consistency": 0.7, "iou": 0.5}}
 
 
 def cells(table):

@@ -324,17 +324,6 @@ def test_instances(tmp_path):
     assert len(instanced().load(tmp_path).faces) == 2
 
 
-def test_instances_that_are_not_read(tmp_path):
-    rows = np.ones((2, 3), "<f4")
-    refused("2 x 3 numbers scale", instanced(TRANSLATION=rows[:1], SCALE=rows).load, tmp_path)
-    refused("2 x 3 numbers rotation", instanced(ROTATION=rows).load, tmp_path)
-    document = skinned()
-    given = {"TRANSLATION": document.array(rows)}
-    document.tree["nodes"][0]["extensions"] = {"EXT_mesh_gpu_instancing": {"attributes": given}}
-    warning = "instances of a skinned mesh (EXT_mesh_gpu_instancing) are not supported"
-    assert warning in document.load(tmp_path).warnings
-
-
 def test_a_mirroring_node_keeps_the_outside(tmp_path):
     nodes = [{"mesh": 0}, {"mesh": 0, "scale": [-1, 1, 1]}]
     document = Document(nodes=nodes, scenes=[{"nodes": [0, 1]}])
@@ -404,21 +393,6 @@ def test_weights_of_a_skin(tmp_path):
     np.testing.assert_allclose(places(mesh), want)
     document.attributes["JOINTS_1"] = document.array(np.full((4, 4), 2, "u1"))
     refused("JOINTS_1 or WEIGHTS_1 is invalid", document.load, tmp_path)
-
-
-@pytest.mark.parametrize("at, valid", [(3, True), (4, False)])
-def test_the_last_sparse_index(tmp_path, at, valid):
-    document = Document()
-    sparse = {
-        "count": 1,
-        "indices": {"bufferView": document.view(bytes([at])), "componentType": 5121},
-        "values": {"bufferView": document.view(np.array([0, 1, 5], "<f4").tobytes())},
-    }
-    document.attributes["POSITION"] = document.array(SQUARE, sparse=sparse)
-    if valid:
-        assert places(document.load(tmp_path))[1, 2].tolist() == [0, 1, 5]
-    else:
-        refused("changes value 4 of 4", document.load, tmp_path)
 
 
 def test_morph_targets_and_sparse_values(tmp_path):

@@ -13,14 +13,7 @@ from PIL import EpsImagePlugin, Image, ImageOps
 
 from gamba_warp.errors import FileWarning, UserError
 from gamba_warp.files import output_folder, write_json
-from gamba_warp.images import (
-    image_size,
-    load_rgba,
-    load_rgba8,
-    open_image,
-    save_image,
-    to_uint8,
-)
+from gamba_warp.images import image_size, load_rgba, load_rgba8, open_image, save_image, to_uint8
 
 
 @pytest.mark.parametrize(

@@ -2,11 +2,8 @@
 
 import os
 import re
-import shutil
 import subprocess
 from pathlib import Path
-
-import pytest
 
 ROOT = Path(__file__).resolve().parents[2]
 SCRIPT = ROOT / "docs" / "examples" / "slurm.sh"
@@ -52,9 +49,3 @@ def test_the_tasks_of_an_array_take_their_parts(tmp_path):
     done = slurm(tmp_path, "data", "render", "MESHES", "--out", "DATA", **task)
     assert done.stdout.split()[1:] == "data render MESHES --out DATA --shard 3/8".split()
     assert slurm(tmp_path, "data", **task).returncode == 2
-
-
-@pytest.mark.skipif(shutil.which("shellcheck") is None, reason="shellcheck is not installed")
-@pytest.mark.parametrize("script", [SCRIPT, ARRAY], ids=lambda path: path.name)
-def test_the_slurm_scripts_are_clean(script):
-    subprocess.run(["shellcheck", str(script)], check=True, timeout=60)

@@ -1,7 +1,6 @@
 """``gamba stress``: a short run, limits that can fail, and failing cases that are made smaller."""
 
 import json
-from dataclasses import replace
 
 import hypothesis
 import pytest
@@ -160,16 +159,6 @@ def test_a_small_error_is_caught_and_reported(monkeypatch, tmp_path, broken_scan
     assert failure["text"] in capsys.readouterr().out
 
 
-def test_a_failing_case_is_made_small(monkeypatch, broken_scan):
-    monkeypatch.setattr(stress, "_SHRINK", 300.0)
-    op = replace(scan.OP, kinds={kind: scan.OP.kinds[kind] for kind in ("uniform", "spread")})
-    run = stress.StressRun([op], CPU, seed=0)
-    run.run(60, 1e9)
-    case = RandomCase(**run.failures[0]["case"])
-    changed = {k for k, v in case.options.items() if v != op.plain[k]}
-    assert changed == {"use_z"} and (case.kind, case.seed) == ("uniform", 0)
-
-
 @pytest.mark.parametrize("value, what", [(float("nan"), "not finite"), (None, "fault")])
 def test_not_finite_and_exceptions_are_failures(monkeypatch, value, what):
     right = scan.selective_scan
@@ -192,21 +181,6 @@ def test_two_runs_that_differ_are_a_failure(monkeypatch):
     plain = scan.OP.plain | {"length": 9}
     outcome = run_case(scan.OP, RandomCase("scan", "uniform", 1, plain), CPU)
     assert outcome.faults == ["two runs differ in out"]
-
-
-def test_interrupted_keeps_what_was_found(tmp_path, monkeypatch, capsys):
-    right, count = scan.selective_scan, iter(range(100))
-
-    def interrupted(*arguments, **options):
-        if next(count) == 6:
-            raise KeyboardInterrupt
-        return right(*arguments, **options)
-
-    monkeypatch.setattr(scan, "selective_scan", interrupted)
-    assert exit_code("scan", "--cases", 24, "--out", tmp_path) == 130
-    document = json.loads((tmp_path / "stress.json").read_text())
-    assert document["interrupted"] and 0 < sum(row["cases"] for row in document["rows"]) < 24
-    assert "interrupted" in capsys.readouterr().out
 
 
 def test_constant_input_matrix_sums_its_gradient_in_float32():
