@@ -12,7 +12,6 @@ from gamba_warp.data.dataset import open_dataset
 from gamba_warp.eval.views import baselines
 from gamba_warp.eval.views.baselines import Retrieval, billboard
 from gamba_warp.eval.views.compare import GroundTruth, ViewsProtocol, load_gt
-from gamba_warp.eval.views.contact_sheet import choose_ranks
 from gamba_warp.eval.views.table import differences_of, means, table_of
 from gamba_warp.formats.ply import save_ply
 from gamba_warp.image_metrics import on_grounds
@@ -281,12 +280,3 @@ def test_table_and_differences():
     text = means([difference], signed=True).splitlines()
     assert len({len(line) for line in text}) == 1
     assert "+2.00 [1.00, 3.00]" in text[2] and "absent" in text[2]
-
-
-def test_ranks_of_a_contact_sheet():
-    assert list(choose_ranks(111, 2).items()) == [
-        *((0, "best"), (1, "best"), (54, "median")),
-        *((55, "median"), (109, "worst"), (110, "worst")),
-    ]
-    assert list(choose_ranks(3, 2)) == [0, 1, 2] and choose_ranks(1, 2) == {0: "best"}
-    assert choose_ranks(0, 2) == {}

@@ -1,4 +1,4 @@
-"""Features that macOS lacks, taken away on the machine of the tests; imports, versions and CI."""
+"""Features that macOS lacks, taken away on the machine of the tests; set-up, versions and CI."""
 
 import os
 import re
@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 import torch
 import warp as wp
+from helpers.children import ran
 from helpers.refusals import refused
 
 from gamba_warp import devices
@@ -137,3 +138,32 @@ def test_what_torch_has_read_already_is_not_changed(monkeypatch):
     assert "torch" in sys.modules or __import__("torch")
     devices.share_cores()
     assert "GOMP_SPINCOUNT" not in os.environ
+
+
+def commands(folder: Path, *words: str) -> str:
+    """Everything that ``make WORDS`` would run where nothing is installed yet."""
+    command = ["make", "--dry-run", f"VENV={folder / 'none'}", *words]
+    done = ran(*command, cwd=ROOT, env={**os.environ, "MAKEFLAGS": ""})
+    assert done.returncode == 0, done.stderr
+    return done.stdout
+
+
+@pytest.mark.parametrize("target", ["setup", "demo"])
+def test_a_user_installs_no_tools_of_developers(target, tmp_path):
+    said = commands(tmp_path, target)
+    assert "--editable '.[all]'" in said and "[test]" not in said
+    assert "--quiet" not in said, "each step has its line, and downloads pip's bars"
+    assert "pip fetches" in said
+
+
+@pytest.mark.parametrize("target", ["test", "lint", "docs", "format", "hostile", "endurance"])
+def test_tests_and_checks_add_their_tools(target, tmp_path):
+    said = commands(tmp_path, target)
+    tools = said.index("--editable '.[test]'")
+    assert said.index("--editable '.[all]'") < tools < said.rindex(str(tmp_path / "none"))
+
+
+def test_a_locked_set_up_has_the_versions_of_constraints(tmp_path):
+    assert "--constraint" not in commands(tmp_path, "test")
+    locked = commands(tmp_path, "test", "LOCKED=1")
+    assert locked.count("--constraint constraints.txt --editable") == 2

@@ -5,12 +5,12 @@ import torch
 from helpers import on_threads
 from helpers.raster import NAMES, leaves, make
 
-from gamba_warp.kernels.rasterize import Skip, autograd, projection, rasterization
+from gamba_warp.kernels.rasterize import Skip, autograd, rasterization
 from gamba_warp.kernels.rasterize.cpu import bin as bin_cpu
-from gamba_warp.kernels.rasterize.cpu.project import project_on_lanes, vjp_on_lanes
+from gamba_warp.kernels.rasterize.cpu.project import vjp_on_lanes
 from gamba_warp.kernels.rasterize.cuda import bin as bin_cuda
-from gamba_warp.kernels.rasterize.cuda.project import project_on_threads, vjp_on_threads
-from gamba_warp.kernels.rasterize.projection import Projected, ProjectionOptions, projection_params
+from gamba_warp.kernels.rasterize.cuda.project import vjp_on_threads
+from gamba_warp.kernels.rasterize.projection import Projected
 from gamba_warp.kernels.rasterize.skip import TILE_TEST
 from gamba_warp.kernels.rasterize.tiles import Tiling, make_grid
 
@@ -110,71 +110,6 @@ def test_repeatable_with_any_number_of_threads(monkeypatch, many):
     for threads in (1, 2, 2, 5):
         with on_threads(threads):
             assert_same(want, call(scene, render_mode="RGB+ED"))
-
-
-def projected(gaussians, colors, **changes):
-    """The inputs, parameters and projection on lanes, which is that on threads to the bit."""
-    viewmats = torch.eye(4).repeat(2, 3, 1, 1)
-    viewmats[..., :3, :3] = torch.linalg.qr(torch.randn(2, 3, 3, 3))[0]
-    viewmats[..., 2, 3] = 2.0
-    Ks = torch.tensor([[300.0, 0, 130], [0, 310.0, 110], [0, 0, 1]]).repeat(2, 3, 1, 1)
-    options = dict(width=257, height=203, near_plane=0.5, far_plane=4.0, radius_clip=0.0)
-    options |= dict(eps2d=0.3, alpha_min=1 / 255, antialiased=0, skip_unused=1)
-    params = projection_params(ProjectionOptions(**options | changes))
-    inputs = [*gaussians, colors, viewmats, Ks]
-    got = projection.project_forward(inputs, params, project_on_lanes)
-    want = projection.project_forward(inputs, params, project_on_threads)
-    for name, value in want._asdict().items():
-        assert torch.equal(getattr(got, name), value), name
-    assert len(got.status.unique()) >= (5 if gaussians[0].shape[1] > 300 else 3)
-    return inputs, params, got
-
-
-@pytest.mark.parametrize(
-    "num, rotated, antialiased, rounded, channels",
-    [(1037, True, 0, 0, 3), (530, True, 1, 0, 1), (77, False, 0, 1, 5), (9, True, 0, 0, 18)],
-)
-def test_projection_on_lanes(num, rotated, antialiased, rounded, channels):
-    means, scales = torch.randn(2, num, 3), torch.exp(torch.randn(2, num, 3) - 3.5)
-    quats, opacities = torch.randn(2, num, 4), torch.rand(2, num)
-    colors = torch.rand(2, num, channels)
-    if rotated and channels == 3:
-        quats[:, :20] = 0
-        for x in (means, quats, scales, opacities, colors):
-            bad = torch.tensor([torch.nan, torch.inf, -torch.inf, 1e30, 1e-30, 0.0]).repeat(2)
-            x.view(-1)[torch.randperm(x.numel())[: len(bad)]] = bad
-    gaussians = means, quats if rotated else None, scales, None, opacities
-    projected(gaussians, colors, radius_clip=1.5, antialiased=antialiased, rounded=rounded)
-
-
-@pytest.mark.parametrize("original, antialiased", [(0, 0), (0, 1), (1, 0), (1, 1)])
-@pytest.mark.parametrize("shape", ["covars", "quats", "scales"])
-def test_projection_of_covariances_and_of_the_original_on_lanes(shape, original, antialiased):
-    """Also backward, and of covariances that rounding has made indefinite."""
-    num = 331
-    means, scales = torch.randn(2, num, 3), torch.exp(2 * torch.randn(2, num, 3) - 3.5)
-    quats, opacities = torch.randn(2, num, 4), torch.rand(2, num)
-    opacities[:, ::7] = 1e-3
-    root = torch.linalg.qr(torch.randn(2, num, 3, 3))[0] * scales[..., None, :]
-    covars = (root @ root.mT)[..., [0, 0, 0, 1, 1, 2], [0, 1, 2, 1, 2, 2]]
-    covars[:, :30, 3:] = covars[:, :30, :3]  # of no Gaussian
-    covars[:, 30:35], covars[0, 35, 2] = 0.0, torch.nan
-    given = {"covars": (None, None, covars), "quats": (quats, scales, None)}
-    gaussians = means, *given.get(shape, (None, scales, None)), opacities
-    options = {"original": original, "antialiased": antialiased}
-    inputs, params, got = projected(gaussians, torch.rand(2, num, 3), **options)
-    v = [torch.randn_like(x) for x in got[:4]]
-    wanted = [x is not None for x in gaussians] + [True]
-    kept = [*gaussians, *inputs[-2:]], params, got.conics, got.status, v, wanted
-    of_lanes, of_threads = (
-        projection.project_backward(*kept, run) for run in (vjp_on_lanes, vjp_on_threads)
-    )
-    names = "means quats scales covars opacities viewmats".split()
-    for name, a, b in zip(names, of_lanes, of_threads):
-        assert (a is None and b is None) or (torch.equal(a, b) and (a != 0).any()), name
-    alone = [True, *[False] * 5]
-    for run in (vjp_on_lanes, vjp_on_threads):
-        assert torch.equal(projection.project_backward(*kept[:-1], alone, run)[0], of_lanes[0])
 
 
 @pytest.mark.parametrize("mode", ["classic", "antialiased"])
