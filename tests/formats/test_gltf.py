@@ -395,6 +395,21 @@ def test_weights_of_a_skin(tmp_path):
     refused("JOINTS_1 or WEIGHTS_1 is invalid", document.load, tmp_path)
 
 
+@pytest.mark.parametrize("at, valid", [(3, True), (4, False)])
+def test_the_last_sparse_index(tmp_path, at, valid):
+    document = Document()
+    sparse = {
+        "count": 1,
+        "indices": {"bufferView": document.view(bytes([at])), "componentType": 5121},
+        "values": {"bufferView": document.view(np.array([0, 1, 5], "<f4").tobytes())},
+    }
+    document.attributes["POSITION"] = document.array(SQUARE, sparse=sparse)
+    if valid:
+        assert places(document.load(tmp_path))[1, 2].tolist() == [0, 1, 5]
+    else:
+        refused("changes value 4 of 4", document.load, tmp_path)
+
+
 def test_morph_targets_and_sparse_values(tmp_path):
     document = Document()
     at, moves = np.array([2], "<u2"), np.array([[0, 0, 5]], "<f4")
