@@ -158,3 +158,21 @@ def test_the_commands_do_what_the_table_says(tmp_path, monkeypatch):
     assert mean == pytest.approx(json.loads(report.read_text())["mean"]["psnr"])
     difference = found["b"]["figures"]["psnr"]["difference"]["mean"]
     assert difference == pytest.approx(found["b"]["figures"]["psnr"]["mean"] - mean)
+
+
+def test_a_child_ends_when_the_caller_is_interrupted(monkeypatch):
+    started = []
+
+    def interrupted(seconds):
+        raise KeyboardInterrupt
+
+    popen = subprocess.Popen
+    waiting = (sys.executable, "-c", "import time; time.sleep(60)")
+    monkeypatch.setattr(processes, "GAMBA", waiting)
+    monkeypatch.setattr(processes.time, "sleep", interrupted)
+    monkeypatch.setattr(
+        processes.subprocess, "Popen", lambda *a, **k: started.append(popen(*a, **k)) or started[0]
+    )
+    with pytest.raises(KeyboardInterrupt), open(os.devnull, "wb") as output:
+        processes.run_gamba([], output, ())
+    assert started[0].returncode == -signal.SIGKILL

@@ -1,3 +1,4 @@
+import importlib.metadata
 import os
 import re
 import subprocess
@@ -8,12 +9,14 @@ from pathlib import Path
 from typing import Annotated
 
 import pytest
+import torch
 import tyro
 from helpers.forked import python
 
-from gamba_warp import __version__, cli
+from gamba_warp import __version__, cli, versions
 from gamba_warp.batch import STAGES
 from gamba_warp.errors import FileWarning, UserError
+from gamba_warp.measure import health
 
 
 def exit_code(arguments):
@@ -219,20 +222,6 @@ def test_help_shows_no_missing_default(name):
     assert "none" in text.split("--mesh ")[1].split("}")[0] if name == "reconstruct" else True
 
 
-@pytest.mark.parametrize("name", cli.COMMANDS)
-def test_lines_of_help_are_filled(name):
-    """tyro ends a line early before words of a docstring's next line that begin with no letter."""
-    lines = cli.help_text(name, cli.load_command(name), []).splitlines()
-    for line, after in zip(lines, lines[1:]):
-        same = re.match(" {10,}", line), re.match(" {10,}", after)
-        if all(same) and same[0][0] == same[1][0]:
-            assert len(line) + 1 + len(after.split()[0]) > 78, (line, after)
-
-
-def test_every_command_has_one_line_of_help():
-    assert all(row.about.endswith(".") and len(row.about) < 60 for row in cli.COMMANDS.values())
-
-
 # Ctrl-C while ``gamba train`` opens its data; in the loop it saves and stops, see test_train.py.
 CTRL_C = """
 import os, runpy, signal, sys
@@ -369,3 +358,60 @@ def test_warnings_of_files_are_one_line(monkeypatch):
     line = warnings.formatwarning("a.png: odd", FileWarning, "images.py", 3)
     assert line == "gamba: warning: a.png: odd\n"
     assert "images.py:3: UserWarning: b" in warnings.formatwarning("b", UserWarning, "images.py", 3)
+
+
+def doctor(capsys, *arguments):
+    code = cli.run("doctor", list(arguments))
+    return code, capsys.readouterr().out
+
+
+def test_it_says_what_is_there(capsys):
+    code, out = doctor(capsys)
+    assert code == 0
+    assert re.search(rf"gamba_warp +{re.escape(__version__)}\n", out)
+    for name in ("torch", "warp-lang", "kornia", "pymeshlab"):
+        assert re.search(rf"{name} +{re.escape(importlib.metadata.version(name))}\n", out)
+    assert re.search(r"open3d(-cpu)? +\d", out) and "not installed" not in out
+    assert re.search(r"cpu +\d+ threads", out) and "--warm-up" in out
+    if not torch.cuda.is_available():
+        assert re.search(r"cuda +none", out)
+    for name in ("open3d", "mp4"):
+        assert re.search(rf"{name} +yes\n", out)
+
+
+def test_missing_weights_come_with_a_remedy_and_are_no_fault(capsys, monkeypatch, tmp_path):
+    monkeypatch.setenv("GAMBA_CACHE", str(tmp_path / "none"))
+    monkeypatch.setattr(health, "DEFAULT_CHECKPOINT", tmp_path / "tiny.safetensors")
+    code, out = doctor(capsys)
+    assert code == 0
+    assert f"{tmp_path}/none (0 MiB)" in out
+    assert re.search(r"lpips +no weights here; 'gamba weights lpips' fetches them", out)
+    assert re.search(r"reconstruct +no shipped model, .*--checkpoint", out)
+    (tmp_path / "tiny.safetensors").touch()
+    assert re.search(r"reconstruct +yes\n", doctor(capsys)[1])
+
+
+def test_a_library_that_does_not_work_is_a_fault(capsys, monkeypatch):
+    def broken():
+        raise OSError("libusb-1.0.so.0: cannot open shared object file\nmore")
+
+    monkeypatch.setattr(health, "import_open3d", broken)
+    code, out = doctor(capsys)
+    assert code == 1 and re.search(r"open3d +no: libusb-1.0.so.0: cannot open .* file\n", out)
+
+
+def test_a_missing_package_is_named(capsys, monkeypatch):
+    monkeypatch.setattr(versions, "_USED", ("torch", "no-such-package"))
+    assert re.search(r"no-such-package +not installed\n", doctor(capsys)[1])
+
+
+def test_warming_up_runs_both_kernels(capsys):
+    code, out = doctor(capsys, "--warm-up")
+    found = re.search(r"cpu +([\d.]+) s to compile or load, then (\d+) ms", out)
+    assert code == 0 and found
+    assert float(found[1]) * 1000 + 50 >= float(found[2])  # rounded to 0.1 s
+
+
+@pytest.mark.gpu
+def test_warming_up_on_the_gpu(capsys):
+    assert re.search(r"cuda +[\d.]+ s to compile or load", doctor(capsys, "--warm-up")[1])

@@ -84,38 +84,3 @@ def test_without_the_shipped_model(starter, tmp_path, monkeypatch, capsys):
     assert demo(starter, tmp_path / "out") == 2
     assert "none.safetensors: no such file" in capsys.readouterr().err
     assert not (tmp_path / "out").exists()
-
-
-class Calls:
-    """Stand-in of the processes that records the stages and writes their results."""
-
-    def __init__(self, monkeypatch, out):
-        self.stages, self.out, self.codes, self.pages = [], out, {}, []
-        monkeypatch.setattr(command, "_call", self)
-        monkeypatch.setattr(
-            "gamba_warp.pages.demo.write_demo", lambda path, results, text: self.pages.append(text)
-        )
-
-    def __call__(self, words):
-        stage = words[0]
-        self.stages.append(stage)
-        code = self.codes.get(stage, 0)
-        folder = dict(zip(ALL, ("icons", "views", "geometry")))[stage]
-        if code == 0:
-            (self.out / folder).mkdir(parents=True, exist_ok=True)
-            (self.out / folder / "report.json").touch()
-        return code
-
-
-ALL = ["reconstruct", "eval-views", "eval-geometry"]
-
-
-def test_a_command_that_fails_ends_the_demo(starter, tmp_path, monkeypatch, capsys):
-    out = tmp_path / "demo"
-    calls = Calls(monkeypatch, out)
-    calls.codes = {"eval-views": 1}
-    assert demo(starter, out) == 2 and calls.stages == ALL[:2]
-    assert "the command above ended with exit code 1" in capsys.readouterr().err
-    calls.codes, calls.stages = {"eval-geometry": 1}, []
-    assert demo(starter, out) == 0 and calls.stages == ALL
-    assert len(calls.pages) == 1 and checkpoint.DEFAULT_CHECKPOINT.name in calls.pages[0]

@@ -49,12 +49,6 @@ def test_torch_warp_and_pytest_are_enough(tmp_path):
     assert "| default | B 1, L 1024, D 256, taps 4 | forward |" in (out / "bench.md").read_text()
 
 
-def test_all_tests_of_the_kernels_are_found():
-    names = {path.name for path in gpu_check.test_files()}
-    assert {"test_gpu.py", "test_machine.py", "test_rasterize_cuda.py"} <= names
-    assert "test_doctor.py" not in names
-
-
 @pytest.mark.parametrize(
     "arguments, reason",
     [([], "no CUDA device"), (["--device", "cpu", "--minutes", "0"], "--minutes 0.0")],
@@ -123,21 +117,3 @@ def test_a_part_is_ended_with_what_it_started(tmp_path, capsys, how):
         assert "x: stopped after 3 s, failed with" in capsys.readouterr().out
     time.sleep(0.5)
     assert is_gone(number.read_text())
-
-
-@pytest.mark.parametrize(
-    "code, said",
-    [
-        ("import os; os.write(1, b'first\\nlast\\n'); os.kill(os.getpid(), 11)",
-         "  first\n  last\nx: failed with signal SIGSEGV"),
-        ("import time; print(1)\ntry: time.sleep(9)\nexcept KeyboardInterrupt: print(2)",
-         "  1\n  2\nx: stopped after 2 s, passed"),
-        ("1 / 0", "ZeroDivisionError: division by zero\nx: failed with exit code 1"),
-        ("print('noise')", "  noise\nx: passed"),
-    ],
-    ids=["a crash", "an interrupt", "an exception", "nothing"],
-)  # fmt: skip
-def test_the_end_of_a_part(tmp_path, capsys, code, said):
-    passed = run_part("x", ("-c", code), tmp_path / "log", 2)
-    out = capsys.readouterr().out
-    assert said in out and passed == ("failed" not in said)

@@ -28,7 +28,6 @@ from gamba_warp.model.predict import reconstruct
 from gamba_warp.photo import cutout
 from gamba_warp.render import render
 from gamba_warp.trajectories.movies import save_turntable, turntable_frames
-from gamba_warp.trajectories.paths import Viewpoint
 
 
 @pytest.fixture
@@ -62,15 +61,6 @@ def test_turntable_begins_at_the_reference_view_and_turns():
     np.testing.assert_allclose(frames / 255, want, atol=0.51 / 255)
     assert (frames[0, 0, 0] == 128).all() and np.ptp(frames) > 55
     assert np.abs(frames[0].astype(int) - frames[2]).max() > 20
-
-
-def test_turntable_chunks_make_no_difference(monkeypatch):
-    gaussians = some(40)
-    whole = turntable_frames(gaussians, Viewpoint(20.0), size=20, frames=7)
-    monkeypatch.setattr("gamba_warp.trajectories.movies._CHUNK_PIXELS", 2 * 20 * 20)
-    np.testing.assert_array_equal(
-        turntable_frames(gaussians, Viewpoint(20.0), size=20, frames=7), whole
-    )
 
 
 def moving(size=(18, 21), count=6):

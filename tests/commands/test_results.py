@@ -81,13 +81,7 @@ def test_results_as_json(tmp_path, checkpoint, splats, capsys):
         and -20 <= (elevation := result.pop("elevation")) <= 65
         and (doubt is None or doubt[0] <= elevation <= doubt[1])
         and result
-        == {
-            "input": str(image),
-            "name": "thing",
-            "warning": "",
-            "gaussians": 64,
-            "notes": [],
-        }
+        == {"input": str(image), "name": "thing", "warning": "", "gaussians": 64, "notes": []}
     )
     options = ["--mesh", "ply", "--voxels", "24", "--views", "8", "--pixels", "48", "--json"]
     assert run("export", [splats, "--out", str(out), *options]) == 0

@@ -12,9 +12,8 @@ import torch
 from helpers import assert_rel_rms
 from helpers.raster import leaves, make, mapped, nerfacc, visible_pairs, weights_by_pixel
 
-from gamba_warp import kernels
 from gamba_warp.compat import gsplat as compat
-from gamba_warp.kernels.rasterize.constants import ALPHA_MIN, COMPENSATION_MIN, TILE
+from gamba_warp.kernels.rasterize.constants import ALPHA_MIN, COMPENSATION_MIN
 
 if importlib.util.find_spec("gsplat") is None:
     pytest.skip("needs the package gsplat (pip install gsplat==1.5.3)", allow_module_level=True)
@@ -173,53 +172,6 @@ def test_lists_of_tiles(packed):
         assert a.dtype == b.dtype and torch.equal(a, b)
     offsets = compat.isect_offset_encode(found[1], images, *grid)
     assert torch.equal(offsets, gsplat._isect_offset_encode(ids, images, *grid))
-
-
-def tile_sets(meta, tiles):
-    """Our pairs as a set of numbers tile * Gaussians + Gaussian, from the lists themselves."""
-    bins = meta.bins
-    tile = torch.repeat_interleave(torch.arange(tiles), bins.starts.diff().long())
-    return tile * meta["depths"].numel() + bins.pairs
-
-
-def best_alphas(meta, tile_pairs, grid, width, height):
-    """The largest alpha of each (tile, Gaussian) pair over the tile's pixels, in float64."""
-    tiles_x, tiles_y = grid
-    tile, gaussian = tile_pairs // meta["depths"].numel(), tile_pairs % meta["depths"].numel()
-    mean = meta["means2d"].reshape(-1, 2).double()[gaussian]
-    a, k, e = meta["conics"].reshape(-1, 3).double()[gaussian, :, None].unbind(1)
-    inside = torch.arange(TILE * TILE)
-    x = (tile % tiles_x * TILE)[:, None] + inside % TILE
-    y = (tile // tiles_x % tiles_y * TILE)[:, None] + inside // TILE
-    dx, dy = x + 0.5 - mean[:, :1], y + 0.5 - mean[:, 1:]
-    q = a * (dx + k * dy) ** 2 + e * dy * dy
-    alpha = meta["opacities"].flatten().double()[gaussian, None] * torch.exp(-0.5 * q)
-    return torch.where((x < width) & (y < height), alpha, 0.0).amax(1)
-
-
-@pytest.mark.parametrize("size, width, height", [(0.02, 70, 45), (0.08, 97, 49), (0.3, 64, 33)])
-def test_tile_lists(size, width, height):
-    """Ours are a part of gsplat's, and no pixel has alpha_min of a pair that we leave out."""
-    scene = make(2, 2, 150, width, height, size=size)
-    scene["scales"][..., 0] *= 4  # longish ones, or the exact test has little to do
-    meta = kernels.rasterization(**scene)[2]
-    grid = -(-width // TILE), -(-height // TILE)
-    tiles = grid[0] * grid[1]
-    radii, means2d, depths, _, _ = project_there(scene)
-    _, isect_ids, flatten_ids = gsplat._isect_tiles(means2d, radii, depths, TILE, *grid)
-    offsets = gsplat._isect_offset_encode(isect_ids, 4, *grid).flatten()
-    ends = torch.cat([offsets[1:], torch.tensor([len(flatten_ids)])])
-    tile = torch.repeat_interleave(torch.arange(4 * tiles), (ends - offsets).long())
-    theirs = tile * depths.numel() + flatten_ids
-    ours = tile_sets(meta, 4 * tiles)
-    assert len(ours) == len(ours.unique()) and len(theirs) == len(theirs.unique())
-    assert 200 < len(ours) < 0.95 * len(theirs)
-    assert torch.isin(ours, theirs).all()
-    dropped = theirs[~torch.isin(theirs, ours)]
-    assert len(dropped) > 100
-    assert (best_alphas(meta, dropped, grid, width, height) < ALPHA_MIN).all()
-    kept = best_alphas(meta, ours, grid, width, height) >= ALPHA_MIN
-    assert kept.float().mean() > 0.9, "few pairs are in our lists for nothing"
 
 
 def lists_of(projected, tile):

@@ -1,4 +1,4 @@
-"""mamba-ssm's blocks against float64, and their weights."""
+"""The blocks and norms of mamba-ssm against float64, and their weights."""
 
 import inspect
 from functools import partial
@@ -12,6 +12,8 @@ from torch import nn
 from gamba_warp.compat.mamba_ssm.models.mixer_seq_simple import _init_weights, create_block
 from gamba_warp.compat.mamba_ssm.modules import block as of_2
 from gamba_warp.compat.mamba_ssm.modules.mamba_simple import Block, Mamba
+from gamba_warp.compat.mamba_ssm.ops.triton import layer_norm as norms
+from gamba_warp.compat.mamba_ssm.ops.triton import layernorm as norms_of_1
 from gamba_warp.compat.mamba_ssm.ops.triton.layer_norm import RMSNorm
 
 WIDTH = 12
@@ -133,11 +135,6 @@ def test_a_block_with_an_mlp():
             ValueError,
             "ssm_cfg.'layer'. is supported only as 'Mamba1'",
         ),
-        (
-            lambda: Mamba(8, bimamba_type="v2"),
-            ValueError,
-            "bimamba_type is 'v2', which is not supp",
-        ),
     ],
 )
 def test_refuses(call, error, text):
@@ -145,3 +142,130 @@ def test_refuses(call, error, text):
         call()
     assert create_block(8, ssm_cfg={"layer": "Mamba1"}).mixer.d_model == 8
     assert Mamba(8, bimamba_type="none").d_model == 8
+
+
+SHAPE, CHANNELS = (2, 5, 11), 11
+# Half a unit in the last place of the output: 2^-12 of float16, 2^-9 of bfloat16.
+LIMITS = {torch.float32: 1e-6, torch.float16: 5e-4, torch.bfloat16: 4e-3}
+
+
+def written_out(rms, eps, x, weight, bias=None, residual=0, x1=0, weight1=None, bias1=None, rows=1):
+    """All outputs in float64, the sum last."""
+    total = x * rows + x1 + residual
+    centred = total if rms else total - total.mean(-1, keepdim=True)
+    unit = centred / (centred.square().mean(-1, keepdim=True) + eps).sqrt()
+    outs = [unit * weight + (0 if bias is None else bias)]
+    if weight1 is not None:
+        outs.append(unit * weight1 + (0 if bias1 is None else bias1))
+    return [*outs, total]
+
+
+GIVEN = [
+    ("weight",),
+    ("weight", "bias", "residual"),
+    ("weight", "bias", "residual", "x1", "weight1", "bias1"),
+    ("weight", "weight1", "x1"),
+    ("weight", "residual", "rowscale"),
+]
+
+
+def inputs(names, dtype):
+    shapes = {"x": SHAPE, "residual": SHAPE, "x1": SHAPE, "rowscale": SHAPE[:-1]}
+    made = {name: torch.randn(shapes.get(name, (CHANNELS,))) for name in ("x", *names)}
+    return {k: v.to(dtype if k in ("x", "x1") else torch.float32) for k, v in made.items()}
+
+
+@pytest.mark.parametrize("dtype", LIMITS, ids=str)
+@pytest.mark.parametrize("names", GIVEN, ids="-".join)
+@pytest.mark.parametrize("function", ["layer_norm_fn", "rms_norm_fn", "rms_norm_ref"])
+def test_the_norms_are_those_of_float64(function, names, dtype):
+    tensors = inputs(names, dtype)
+    leaves = {k: v.clone().requires_grad_() for k, v in tensors.items()}
+    found = getattr(norms, function)(**{"bias": None, **leaves}, eps=1e-3, prenorm=True)
+    wide = {k: v.double().requires_grad_() for k, v in tensors.items()}
+    named = {k: v for k, v in wide.items() if k != "rowscale"}
+    if "rowscale" in wide:
+        named["rows"] = wide["rowscale"][..., None]
+    wanted = written_out(function != "layer_norm_fn", 1e-3, **named)
+    assert len(found) == len(wanted)
+    kept = dtype if "residual" not in names else torch.float32
+    assert [y.dtype for y in found] == [dtype] * (len(found) - 1) + [kept]
+    cotangents = [torch.randn(SHAPE).to(y.dtype) for y in found]
+    for place, (got, want) in enumerate(zip(found, wanted)):
+        assert_rel_rms(got, want, LIMITS[dtype], f"output {place}")
+    grads = torch.autograd.grad(found, list(leaves.values()), cotangents)
+    want = torch.autograd.grad(wanted, list(wide.values()), [c.double() for c in cotangents])
+    for name, got, value in zip(leaves, grads, want):
+        assert_rel_rms(got, value, 2 * LIMITS[dtype], name)  # sums of rounded products
+    alone = getattr(norms, function)(**{"bias": None, **tensors}, eps=1e-3)
+    firsts = alone if isinstance(alone, tuple) else (alone,)
+    assert len(firsts) == len(found) - 1 and all(map(torch.equal, firsts, found))
+
+
+@pytest.mark.parametrize("residual", [None, torch.float32, torch.bfloat16], ids=str)
+@pytest.mark.parametrize("in_fp32", [False, True])
+def test_the_dtype_of_the_sum(residual, in_fp32):
+    x, weight = torch.randn(SHAPE).bfloat16(), torch.rand(CHANNELS)
+    given = None if residual is None else torch.randn(SHAPE).to(residual)
+    layer = norms.RMSNorm(CHANNELS)
+    for out, total in (
+        norms.rms_norm_fn(x, weight, None, given, prenorm=True, residual_in_fp32=in_fp32),
+        layer(x, given, prenorm=True, residual_in_fp32=in_fp32),
+    ):
+        default = torch.float32 if in_fp32 else torch.bfloat16
+        assert out.dtype == torch.bfloat16 and total.dtype == (residual or default)
+    total = norms.rms_norm_ref(x, weight, None, given, prenorm=True, upcast=True)[1]
+    assert total.dtype == (residual or torch.float32)
+
+
+def test_dropout_is_that_of_its_masks():
+    x, x1, residual = torch.randn(3, 64, 32, 17)
+    weight, weight1 = torch.rand(2, 17)
+    given = {"residual": residual, "x1": x1, "weight1": weight1, "dropout_p": 0.25}
+    *outs, total, mask, mask1 = norms.layer_norm_fn(
+        x, weight, None, **given, prenorm=True, return_dropout_mask=True
+    )
+    for kept in (mask, mask1):
+        assert kept.dtype == torch.bool and abs(kept.float().mean() - 0.75) < 0.02
+    assert not torch.equal(mask, mask1)
+    want = written_out(False, 1e-6, x * mask / 0.75, weight, None, residual, x1 * mask1 / 0.75)
+    assert_rel_rms(total, want[-1], 1e-6, "sum")
+    assert_rel_rms(outs[0], want[0], 1e-6, "out")
+    by_place = x, weight, None, residual, x1, weight1, None, 1e-6, 0.25, None, True
+    again = norms.layer_norm_ref(*by_place, mask, mask1)
+    for got, value in zip(again, (*outs, total), strict=True):
+        assert_rel_rms(got, value, 1e-6, "reference")
+    layer = norms.RMSNorm(17, dropout_p=0.5)
+    assert not torch.equal(layer(x), layer(x)) and torch.equal(layer.eval()(x), layer(x))
+    assert len(norms.rms_norm_fn(*by_place, False, True)) == 5
+    none = norms.layer_norm_fn(x, weight, None, return_dropout_mask=True)
+    assert len(none) == 3 and none[1] is none[2] is None
+
+
+def test_the_layer_and_the_path_of_mamba_ssm_1():
+    assert all(getattr(norms_of_1, name) is getattr(norms, name) for name in norms.__all__)
+    layer = norms.RMSNorm(8, eps=1e-2, dtype=torch.float64)
+    assert list(layer.state_dict()) == ["weight"] and layer.bias is None and layer.eps == 1e-2
+    x = torch.randn(3, 8, dtype=torch.float64)
+    assert torch.allclose(layer(x), written_out(True, 1e-2, x, 1)[0], rtol=1e-12)
+
+
+@pytest.mark.parametrize(
+    "change, error, text",
+    [
+        ({"x": [1.0]}, TypeError, "x must be a tensor.*, got list"),
+        ({"weight": torch.ones(3)}, ValueError, r"weight must have shape \[11\].*, got \[3\]"),
+        ({"residual": torch.ones(5, 11)}, ValueError, r"residual must have shape \[2, 5"),
+        ({"x1": 1e-5}, TypeError, "x1 must be.*got float"),
+        (
+            {"rowscale": torch.ones(2, 5), "x1": torch.ones(SHAPE)},
+            ValueError,
+            "pass either rowscale or x1",
+        ),
+        ({"rowscale": torch.ones(2)}, ValueError, "rowscale must have shape"),
+    ],
+)
+def test_refusals_of_the_norms(change, error, text):
+    given = {"x": torch.ones(SHAPE), "weight": torch.ones(CHANNELS), "bias": None}
+    with pytest.raises(error, match=f"^{text}"):
+        norms.layer_norm_fn(**given | change)

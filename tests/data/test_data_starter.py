@@ -5,8 +5,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 import trimesh
-from helpers.refusals import refused
-from lab.starter import starter
 
 from gamba_warp.data.dataset import SPLITS, open_dataset
 from gamba_warp.images import load_rgba
@@ -78,9 +76,3 @@ def test_geometry_lies_in_the_views_frame(uid):
         shown = image[..., 3].numpy() > 0.5
         # pixels on the outline may fall either way: up to 4 % of thin-legged objects
         assert (hit & shown).sum() / (hit | shown).sum() > 0.93, uid
-
-
-def test_folders_of_others_are_not_removed(tmp_path):
-    (tmp_path / "out" / "data").mkdir(parents=True)
-    refused("data: was not made by this command", starter, tmp_path / "furniture", tmp_path / "out")
-    assert (tmp_path / "out" / "data").is_dir()

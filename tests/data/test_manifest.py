@@ -151,18 +151,3 @@ def test_names_within_a_folder_are_those_of_inside(tmp_path):
         assert within.path(name, "s") == inside(folder, name, "s")
     for name in ("out.png", "away/z.png", "../outside/z.png", "/etc/passwd", "a\\b", "", 3):
         assert refused("s: ", within.path, name, "s") == refused("s: ", inside, folder, name, "s")
-
-
-def test_few_system_calls_an_object_and_few_kept(data, monkeypatch):
-    calls = []
-    stat, scandir = os.stat, os.scandir
-    monkeypatch.setattr(os, "stat", lambda *a, **k: (calls.append(a), stat(*a, **k))[1])
-    monkeypatch.setattr(os, "scandir", lambda *a: (calls.append(a), scandir(*a))[1])
-    open_dataset(data)
-    # Two an object; the root, the manifest, and the lists of two folders with their subfolders.
-    assert len(calls) <= 2 * 4 + 10
-    monkeypatch.setattr(datasets, "KEPT", 2)
-    found = open_dataset(data)
-    for uid in ("clouda", "cloudd", "more/cloudb", "clouda"):
-        assert found.num_views(uid) == micro.VIEWS
-        assert len(found._files) <= 2

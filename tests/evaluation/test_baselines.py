@@ -12,7 +12,6 @@ from gamba_warp.data.dataset import open_dataset
 from gamba_warp.eval.views import baselines
 from gamba_warp.eval.views.baselines import Retrieval, billboard
 from gamba_warp.eval.views.compare import GroundTruth, ViewsProtocol, load_gt
-from gamba_warp.eval.views.contact_sheet import Row, choose_ranks, contact_sheet
 from gamba_warp.eval.views.table import differences_of, means, table_of
 from gamba_warp.formats.ply import save_ply
 from gamba_warp.image_metrics import on_grounds
@@ -281,23 +280,3 @@ def test_table_and_differences():
     text = means([difference], signed=True).splitlines()
     assert len({len(line) for line in text}) == 1
     assert "+2.00 [1.00, 3.00]" in text[2] and "absent" in text[2]
-
-
-def test_contact_sheet(tmp_path):
-    assert list(choose_ranks(111, 2).items()) == [
-        *((0, "best"), (1, "best"), (54, "median")),
-        *((55, "median"), (109, "worst"), (110, "worst")),
-    ]
-    assert list(choose_ranks(3, 2)) == [0, 1, 2] and choose_ranks(1, 2) == {0: "best"}
-    assert choose_ranks(0, 2) == {}
-    red, blue = torch.tensor([1.0, 0, 0]), torch.tensor([0, 0, 1.0])
-    flat = torch.ones(20, 40, 3)
-    rows = [
-        Row(["one"], flat * red, flat[None] * blue, flat[None] * red),
-        Row(["two"], flat * red, flat.expand(2, -1, -1, -1), flat.expand(2, -1, -1, -1)),
-    ]
-    contact_sheet(tmp_path / "sheet.png", rows)
-    sheet = load_rgba(tmp_path / "sheet.png")[..., :3]
-    columns = [int(x) for x in (sheet[22 + 64] == [0, 0, 1]).all(-1).nonzero()[0][[0, -1]]]
-    assert 120 < columns[1] - columns[0] < 128  # one tile of blue, 128 wide less its outline
-    assert (sheet[22 + 64, columns[0] - 64] == [1, 0, 0]).all()  # the input, to its left

@@ -179,10 +179,7 @@ def two_at_one_camera(folder):
 @pytest.mark.parametrize(
     "spoil, said",
     [
-        (
-            lambda folder: (folder / "view2.png").unlink(),
-            "no image of the name of view 2 (1 of",
-        ),
+        (lambda folder: (folder / "view2.png").unlink(), "no image of the name of view 2 (1 of"),
         (lambda x: shutil.copy(x / "view2.png", x / "view2.webp"), "view2.png has the same name"),
         (double_a_number, "has the same number"),
         (shrink, "is 12x12, the images compared are 24x24"),

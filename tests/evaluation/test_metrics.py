@@ -5,18 +5,16 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from helpers.views import around, eval_views, straight, write_views
+from helpers.views import around
 
-from gamba_warp.cli import run
 from gamba_warp.conventions import over_another, over_background
 from gamba_warp.eval.report import failure, intervals_of, make_report, mean_of, save_report
 from gamba_warp.eval.shapes.metrics import surface_metrics
 from gamba_warp.eval.shapes.protocol import PRESETS
 from gamba_warp.eval.shapes.shape import Points
 from gamba_warp.eval.views.compare import GroundTruth, Shown, compare, render_views
-from gamba_warp.formats.ply import save_ply
 from gamba_warp.gaussians import Gaussians
-from gamba_warp.image_metrics import METRICS, Metric, mask_iou, on_grounds, psnr, ssim
+from gamba_warp.image_metrics import mask_iou, on_grounds, psnr, ssim
 from gamba_warp.render import render
 
 pytestmark = pytest.mark.usefixtures("one_thread")
@@ -162,40 +160,3 @@ def test_known_values_on_each_ground():
         assert view["psnr_grey"] == pytest.approx(-20 * math.log10(0.125), abs=1e-5)
     assert values["opaque"][0]["psnr"] == 100
     assert {values["opaque"][0][key] for key in on_grounds()} == {None}
-
-
-@pytest.fixture
-def red_ball(tmp_path):
-    """A dataset of one ball in data/, and itself in pred/."""
-    write_views(tmp_path / "data" / "a", straight(balls(RED), cameras()), cameras())
-    (tmp_path / "pred").mkdir()
-    save_ply(tmp_path / "pred" / "a.ply", balls(RED))
-    return tmp_path
-
-
-def test_a_metric_of_the_registry_is_everywhere(red_ball, monkeypatch, capsys):
-    """Present in records, means, baselines, differences, CSV, tables, and comparisons."""
-
-    def mean_error(a, b):
-        return (a.double() - b.double()).abs().mean((-3, -2, -1))
-
-    metric = Metric("mean error", mean_error, digits=4, more_is_better=False, on_grounds=True)
-    monkeypatch.setitem(METRICS, "mae", metric)
-    pred, data = red_ball / "pred", red_ball / "data"
-    _, report = eval_views(pred, data, red_ball, "--split", "all")
-    for key in ("mae", "mae_black", "mae_grey"):
-        assert report["objects"][0][key] == report["mean"][key] < 0.01
-        assert report["baselines"]["background"][key] > report["mean"][key]
-        assert report["table"][0][key]["mean"] == report["mean"][key]
-        assert report["differences"][0][key]["mean"] < 0
-    header = (red_ball / "objects.csv").read_text().partition("\n")[0].split(",")
-    assert {"mae", "input.mae_grey", "baselines.billboard.mae"} <= set(header)
-    said = capsys.readouterr().out
-    assert "| mean error " in said and "| median mean error " in said
-    assert "| mean error on black " in said
-    assert run("compare", [f"x={red_ball}", f"y={red_ball}", "--out", str(red_ball)]) == 0
-    joined = json.loads((red_ball / "compare.json").read_text())
-    assert joined["rows"][0]["mae"]["mean"] == report["mean"]["mae"]
-    assert joined["differences"][0]["mae_grey"]["mean"] == 0
-    said = capsys.readouterr().out
-    assert "| mean error ↓ |" in said and "| mean error on grey ↓ |" in said

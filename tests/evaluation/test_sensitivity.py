@@ -31,20 +31,6 @@ def folders(tmp_path):
     return tmp_path
 
 
-def test_variants_change_one_field_and_keep_the_place():
-    base = replace(SMALL, frame="unit", up="y")
-    found = sensitivity.variants(base)
-    assert found.pop(sensitivity.CHOSEN) == base
-    for label, protocol in found.items():
-        assert (protocol.frame, protocol.up) == ("unit", "y")
-        if not label.startswith("protocol "):
-            field = label.partition(" =")[0]
-            changed = {k for k in base.fields() if base.fields()[k] != protocol.fields()[k]}
-            assert changed == {field.partition(".")[0]}
-    names = {n for label in found if label.startswith("protocol ") for n in label[9:].split(", ")}
-    assert names == PRESETS.keys()
-
-
 def assert_as_alone(pair, protocols, found):
     """Each row is what a direct evaluation by its protocol gives."""
     gt = load_gt(pair.gt, SMALL)

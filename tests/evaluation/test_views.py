@@ -1,6 +1,7 @@
 import math
 import subprocess
 import sys
+from pathlib import Path
 
 import pytest
 import torch
@@ -12,6 +13,7 @@ from helpers.views import around, cloud_of, evaluated, straight, write_views
 from gamba_warp.cameras import Cameras, relative_to_reference
 from gamba_warp.eval.views import evaluate as module
 from gamba_warp.eval.views.compare import Shown, choose_views
+from gamba_warp.eval.views.options import ViewsOptions
 from gamba_warp.formats.ply import save_ply
 
 SIZE = 48
@@ -246,31 +248,15 @@ def test_saved_gaussians_evaluate_to_the_same(data, painted):
     assert again["mean"]["psnr"] == report["mean"]["psnr"] > 30
 
 
-def test_bad_files_stop_no_other_object(data, painted, monkeypatch):
-    """Also one that goes bad between its evaluation and the contact sheet."""
-    (data / "pred" / "a.ply").unlink()
-    (data / "pred" / "a.ply").symlink_to("nowhere")
-    real = module.contact_sheet
-    monkeypatch.setattr(module, "contact_sheet", lambda *_: pytest.fail("there is nothing to show"))
+def test_a_protocol_fills_in_what_is_not_given_and_names_what_is():
+    """Also where the given is the default without a protocol."""
 
-    def evaluate_and_spoil(job, uid, *rest):
-        if uid == "c":
-            raise OSError(5, "Input/output error")
-        record = module_evaluate(job, uid, *rest)
-        (data / "data" / uid / "0.png").write_bytes(b"not an image")
-        return record
+    def filled(**given):
+        return ViewsOptions(checkpoint=Path("a"), data=Path("b"), **given).filled()
 
-    module_evaluate = module.evaluate_object
-    monkeypatch.setattr(module, "evaluate_object", evaluate_and_spoil)
-    code, report = evaluate(data, "--no-baselines")
-    assert code == 1 and [r["name"] for r in report["objects"] if r["status"] == "ok"] == [
-        "group/b"
-    ]
-    assert {r["name"] for r in report["failures"]} == {"a", "c"}
-    write_object(data / "data" / "new", POINTS["a"])
-    save_ply(data / "pred" / "new.ply", one(in_reference_world(POINTS["a"])))
-    monkeypatch.setattr(module, "evaluate_object", module_evaluate)
-    monkeypatch.setattr(module, "contact_sheet", real)
-    code, report = evaluate(data, "--no-baselines")
-    assert code == 1 and len(report["failures"]) == 2 and report["num_ok"] == 2
-    assert (data / "out" / "contact_sheet.png").exists()
+    default, splatter = filled(), filled(protocol="splatter-image")
+    assert (default.reference, default.size, default.changed()) == (0, None, [])
+    assert (splatter.reference, splatter.size, splatter.changed()) == (64, 128, [])
+    changed = filled(protocol="splatter-image", reference=0, size=64)
+    assert (changed.reference, changed.size) == (0, 64)
+    assert changed.changed() == ["size", "reference"]

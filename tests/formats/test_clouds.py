@@ -14,11 +14,7 @@ COUNT = 2500
 POINTS = np.random.default_rng(0).normal(size=(COUNT, 3)).astype(np.float32)
 ROWS = [" ".join(map(repr, row)) for row in POINTS.tolist()]
 GARBAGE = ["no numbers here"] * COUNT
-KINDS = [
-    ("a.xyz", {}),
-    ("text.ply", {"write_ascii": True}),
-    ("binary.ply", {}),
-]
+KINDS = [("a.xyz", {}), ("text.ply", {"write_ascii": True}), ("binary.ply", {})]
 
 
 def ply(rows, count=COUNT):

@@ -249,12 +249,6 @@ def test_a_part_that_is_invisible_beside_others_stays_so(tmp_path):
     assert [material.color[3] for material in mesh.materials] == [0, 1] and not mesh.warnings
 
 
-def test_an_unlit_surface_is_named(tmp_path):
-    document = Document(materials=[{"extensions": {"KHR_materials_unlit": {}}}])
-    document.primitive["material"] = 0
-    assert document.load(tmp_path).warnings == ["an unlit surface is drawn shaded"]
-
-
 def test_diffuse_and_specular(tmp_path):
     """A nonmetal of the older kind of material has its diffuse colour."""
     gloss = {"diffuseFactor": [0.5, 0.25, 0.125, 1], "specularFactor": [0.04, 0.04, 0.04]}
@@ -328,17 +322,6 @@ def test_instances(tmp_path):
     np.testing.assert_allclose(across[:, 2], [6, 6, 1, 1])
     assert corners[2:, :, 0].max() == -5 and corners[2:, :, 0].min() == -6
     assert len(instanced().load(tmp_path).faces) == 2
-
-
-def test_instances_that_are_not_read(tmp_path):
-    rows = np.ones((2, 3), "<f4")
-    refused("2 x 3 numbers scale", instanced(TRANSLATION=rows[:1], SCALE=rows).load, tmp_path)
-    refused("2 x 3 numbers rotation", instanced(ROTATION=rows).load, tmp_path)
-    document = skinned()
-    given = {"TRANSLATION": document.array(rows)}
-    document.tree["nodes"][0]["extensions"] = {"EXT_mesh_gpu_instancing": {"attributes": given}}
-    warning = "instances of a skinned mesh (EXT_mesh_gpu_instancing) are not supported"
-    assert warning in document.load(tmp_path).warnings
 
 
 def test_a_mirroring_node_keeps_the_outside(tmp_path):
@@ -427,17 +410,6 @@ def test_the_last_sparse_index(tmp_path, at, valid):
         refused("changes value 4 of 4", document.load, tmp_path)
 
 
-def test_the_first_chunk_of_a_kind_counts(tmp_path):
-    document = Document()
-    document.tree["buffers"] = [{"byteLength": len(document.binary)}]
-    other = Document(nodes=[{"mesh": 0, "translation": [5, 5, 5]}])
-    other.tree["buffers"] = [{"byteLength": len(other.binary)}]
-    data = glb(document.tree, document.binary) + glb(other.tree, bytes(len(other.binary)))[12:]
-    path = tmp_path / "a.glb"
-    path.write_bytes(data[:8] + len(data).to_bytes(4, "little") + data[12:])
-    np.testing.assert_array_equal(places(load_mesh(path)), SQUARE[CORNERS.reshape(2, 3)])
-
-
 def test_morph_targets_and_sparse_values(tmp_path):
     document = Document()
     at, moves = np.array([2], "<u2"), np.array([[0, 0, 5]], "<f4")
@@ -512,20 +484,23 @@ def beside(mode):
 
 MATERIAL = ("materials", 0)
 UNREAD = {
-    "points": (beside(0), "only triangles are read, not points"),
-    "lines": (beside(1), "only triangles are read, not lines"),
-    "a line loop": (beside(2), "only triangles are read, not a line loop"),
-    "a line strip": (beside(3), "only triangles are read, not a line strip"),
+    **{
+        name: (beside(mode), f"only triangles are read, not {name}")
+        for mode, name in enumerate(("points", "lines", "a line loop", "a line strip"))
+    },
+    "unlit": (
+        changed((*MATERIAL, "extensions"), {"KHR_materials_unlit": {}}),
+        "an unlit surface is drawn shaded",
+    ),
     "no POSITION": (without_position, "a primitive without POSITION is ignored"),
     "scenes": (lambda d: d.tree["scenes"].append({}), "one of 2 scenes is read"),
-    "KTX2": (
-        changed(("textures", 0), {"extensions": {"KHR_texture_basisu": {"source": 0}}}),
-        "a texture's image is named by KHR_texture_basisu, which is not supported",
-    ),
-    "DDS": (
-        changed(("textures", 0), {"extensions": {"MSFT_texture_dds": {"source": 0}}}),
-        "a texture's image is named by MSFT_texture_dds, which is not supported",
-    ),
+    **{
+        name: (
+            changed(("textures", 0), {"extensions": {name: {"source": 0}}}),
+            f"a texture's image is named by {name}, which is not supported",
+        )
+        for name in ("KHR_texture_basisu", "MSFT_texture_dds")
+    },
     "no source": (
         changed(("textures", 0), {}),
         "a texture's image is named by nothing, which is not supported",
@@ -586,12 +561,6 @@ def test_unread_content_is_named(tmp_path, name):
     change(document)
     mesh = document.load(tmp_path)
     assert warning in mesh.warnings and len(mesh.faces) == 2
-
-
-def test_names_that_look_like_extensions(tmp_path):
-    document = Document(nodes=[{"mesh": 0, "name": "LP_body"}]).paint()
-    document.attributes["_BATCHID"] = 0
-    assert not document.load(tmp_path).warnings
 
 
 @pytest.mark.parametrize(

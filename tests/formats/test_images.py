@@ -13,14 +13,7 @@ from PIL import EpsImagePlugin, Image, ImageOps
 
 from gamba_warp.errors import FileWarning, UserError
 from gamba_warp.files import output_folder, write_json
-from gamba_warp.images import (
-    image_size,
-    load_rgba,
-    load_rgba8,
-    open_image,
-    save_image,
-    to_uint8,
-)
+from gamba_warp.images import image_size, load_rgba, load_rgba8, open_image, save_image, to_uint8
 
 
 @pytest.mark.parametrize(
@@ -294,20 +287,6 @@ def test_what_is_no_profile_is_said_and_keeps_the_pixels(tmp_path, mode, profile
         got = load_rgba(path)
     want = np.asarray(colours(mode).convert("RGBA")) / np.float32(255)
     np.testing.assert_array_equal(got, want)
-
-
-def test_without_littlecms_the_pixels_stay(tmp_path, monkeypatch):
-    from PIL import ImageCms
-
-    def missing(*_):
-        raise ImportError("no littleCMS")
-
-    monkeypatch.setattr(ImageCms, "ImageCmsProfile", missing)
-    colours().save(tmp_path / "a.png", icc_profile=colour_profile(ADOBE_RGB, 2.1))
-    said = []
-    got = load_rgba(tmp_path / "a.png", warn=said.append)
-    np.testing.assert_array_equal(got[..., :3], np.asarray(colours()) / np.float32(255))
-    assert len(said) == 1 and "a.png" in said[0] and "no littleCMS" in said[0]
 
 
 def test_float_tiff_is_scaled_and_stays_finite(tmp_path):

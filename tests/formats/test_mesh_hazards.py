@@ -32,6 +32,15 @@ def ascii_ply(vertices, faces):
     return head + "\n".join([*vertices, *faces]) + "\n"
 
 
+def counted(vertices, faces, kind="uchar", length=3):
+    """Return a binary .ply of one triangle whose header states these numbers."""
+    head = f"ply\nformat binary_little_endian 1.0\nelement vertex {vertices}\n"
+    head += "".join(f"property float {axis}\n" for axis in "xyz")
+    head += f"element face {faces}\nproperty list {kind} int vertex_indices\nend_header\n"
+    face = struct.pack("<B3i" if kind == "uchar" else "<I3i", length, 0, 1, 2)
+    return head.encode() + np.eye(3, dtype="<f4").tobytes() + face
+
+
 CORNERS = ["0 0 0", "1 0 0", "0 1 0", "0 0 1"]
 BAD = {
     "empty.obj": ("", "the file is empty"),
@@ -74,6 +83,14 @@ BAD = {
     "short_first.ply": (ascii_ply(CORNERS, ["3 0 1", "3 0 1 2"]), "a row of 3 numbers, not 4"),
     "half.ply": (ascii_ply(CORNERS, ["3 0 1 2", "3 0 1 1.5"]), "vertex_indices is 1.5"),
     "vertex_word.ply": (ascii_ply([*CORNERS, "0 0 x"], ["3 0 1 2"]), "could not convert"),
+    "vertices.ply": (counted(10**12, 1), "invalid header"),
+    "faces.ply": (counted(3, 10**12), "invalid header"),
+    "text.ply": (counted(10**12, 1).replace(b"binary_little_endian", b"ascii"), "text.ply"),
+    "list.ply": (counted(3, 1, "uint", 2**31), "list.ply"),
+    "count.stl": (bytes(80) + struct.pack("<I", 2**32 - 1) + bytes(50), "count.stl"),
+    "short.stl": (bytes(60), "short.stl"),
+    "count.off": (OFF.replace("4 2 0", f"{10**12} {10**12} 0"), "invalid header"),
+    "index.obj": (V + f"f 1 2 {10**25}\n", "index.obj"),
 }
 
 
@@ -83,8 +100,11 @@ def test_bad_meshes_are_one_line(tmp_path, name):
     path = tmp_path / name
     path.write_bytes(text if isinstance(text, bytes) else text.encode())
     start = time.process_time()
+    tracemalloc.start()
     said = refused(None, load_mesh, path)
-    assert time.process_time() - start < 5  # one of them took minutes
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert time.process_time() - start < 5 and peak < 200e6  # one of them took minutes
     assert reason in said and name in said
     path.unlink()
     refused("no such file|not a mesh file", load_mesh, path)

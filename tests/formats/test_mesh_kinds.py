@@ -259,10 +259,7 @@ def test_light_and_moved_textures_of_mtl(tmp_path):
     for files, warning in (
         ({"mtl": MTL + "Ke 1 1 1\n"}, "emission of a surface with a base colour is not drawn"),
         ({"mtl": moved}, "-s 2 2 1 paint.png: the option -s is not read"),
-        (
-            {"obj": QUAD.replace("-1 0 0", "-1 0 0 1 0 0")},
-            "colours with a texture are not drawn",
-        ),
+        ({"obj": QUAD.replace("-1 0 0", "-1 0 0 1 0 0")}, "colours with a texture are not drawn"),
     ):
         assert load_mesh(write_quad(tmp_path, **files)).warnings == [warning]
 

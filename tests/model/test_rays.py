@@ -263,12 +263,7 @@ def test_the_margin_lets_the_network_see_more_patches():
     assert near.num == wide.num == 3 and (near.means - wide.means).abs().max() > 1e-3
 
 
-def test_configurations_of_older_files_mean_the_paper():
-    old = GambaConfig(encoder="none").to_json()
-    values = [
-        part for part in old[1:-1].split(", ") if "ray_" not in part and 'decoder"' not in part
-    ]
-    assert GambaConfig.from_json("{" + ", ".join(values) + "}").decoder == "bins"
+def test_sizes_that_do_not_fit_are_refused():
     refused("patch_size 4 is not a multiple of ray_cells 3", rays, ray_cells=3)
     refused("ray_cells 4 is not a multiple of ray_coarse 3", rays, ray_cells=4, ray_coarse=3)
     with pytest.raises(ValueError, match=r"images is \(1, 12, 12, 3\), expected"):

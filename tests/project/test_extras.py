@@ -142,18 +142,6 @@ def test_training_loads_without_what_makes_objects(monkeypatch):
     assert found.value.name == "manifold3d"
 
 
-@pytest.mark.slow
-def test_a_image_becomes_gaussians_and_a_page_with_the_core_alone(tmp_path):
-    image = cut_out(tmp_path / "thing.png")
-    small = ("--size", 16, "--frames", 2, "--out", tmp_path / "out")
-    done = in_the_core("reconstruct", image, *small, "--sheet", tmp_path / "sheet.png")
-    assert done.returncode == 0, done.stderr
-    assert {"thing.ply", "thing.gif", "thing.html"} <= {
-        p.name for p in (tmp_path / "out").iterdir()
-    }
-    assert (tmp_path / "sheet.png").exists()
-
-
 @pytest.mark.parametrize(
     "arguments, library, extra",
     [

@@ -1,4 +1,4 @@
-"""The site builds without broken links, and README keeps its promises."""
+"""The site builds without broken links; tables and scripts that its pages show."""
 
 import os
 import re
@@ -10,7 +10,8 @@ from pathlib import Path
 import pytest
 import yaml
 from helpers.children import ran
-from website.links import rewritten, targets
+from lab import scanned
+from website.links import rewritten
 
 from gamba_warp.versions import __version__
 
@@ -71,59 +72,11 @@ def test_a_page_loads_nothing_from_elsewhere(site):
         assert not outside, f"{page}: {outside}"
 
 
-def test_the_command_that_make_docs_prints_serves_the_site_with_its_search(site, browser_page):
-    makefile = (ROOT / "Makefile").read_text(encoding="utf-8")
-    words = re.search(r'@echo "[^"]*: \$\(BIN\)/python (-m http\.server [^"]*)"', makefile)[1]
-    words = words.replace("--directory site", f"--directory {site}")
-    command = [sys.executable, "-u", *words.split(), "0"]
-    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as server:
-        try:
-            page = browser_page(re.search(r"http://\S+/", server.stdout.readline())[0], 1300).page
-
-            search = page.locator("[data-md-component=search-query]")
-            search.fill("turntable")
-
-            def found():  # the page reads what is typed as a key goes up
-                search.press("End")
-                page.wait_for_timeout(1000)
-                return page.query_selector(".md-search-result__item a")
-
-            assert any(found() for _ in range(60))
-        finally:
-            server.kill()
-
-
 def test_links_keep_their_anchors_and_blocks_of_code_are_left():
     text = "[a](../eval/README.md#b) [c](#d) [e](https://f.org/g.md)\n"
     block = f"```text\n{text}```\n"
     new = "[a](repository/eval.md#b) [c](#d) [e](https://f.org/g.md)\n"
     assert rewritten(text + block, "docs/gpu.md", "gpu.md") == new + block
-
-
-def test_the_readme_is_short_and_its_links_lead_somewhere():
-    assert README.count("\n") <= 100
-    first = README[: README.index("\n## ")]
-    moving = re.search(r"!\[[^\]]+\]\((docs/images/[^)]+)\)", first)
-    assert moving is not None
-    image = ROOT / moving[1]
-    assert image.stat().st_size < 1.5e6
-    for path in targets(README, "README.md"):
-        assert (ROOT / path).exists(), path
-
-
-def test_each_mark_beside_others_has_its_proof():
-    text = (ROOT / "docs" / "index.md").read_text(encoding="utf-8")
-    page = text.partition("## Similar projects")[2]
-    lines = [line for line in page.split("\n") if line.startswith("| ")]
-    named = dict(re.findall(r"^\[(\w+)\]: (https://\S+)$", page, re.MULTILINE))
-    assert len(lines) > 8
-    for line in lines[2:]:
-        title, *cells = line.strip("| ").split(" | ")
-        assert len(cells) == 6, title
-        for cell in cells:
-            links = re.findall(r"\]\(([^)]+)\)", cell)
-            links += [named[name] for name in re.findall(r"\]\[(\w+)\]", cell)]
-            assert links, f"{title}: {cell}"
 
 
 def test_the_citation_is_that_of_the_paper():
@@ -135,3 +88,80 @@ def test_the_citation_is_that_of_the_paper():
     flat = " ".join(bibtex.split())
     assert " and ".join(names) in flat and paper["title"] in flat
     assert f"{{{paper['year']}}}" in flat and "2403.18795" in flat
+
+
+def figures_of(psnr):
+    return {"psnr": psnr, "ssim": 0.8, "lpips": None, "mask_iou": 0.5}
+
+
+def row(name, psnr, views="novel"):
+    cells = {key: None if v is None else {"mean": v} for key, v in figures_of(psnr).items()}
+    return {"views": views, "name": name, **cells}
+
+
+VIEWS = {
+    "protocol": {"source": {"path": "m.safetensors", "sha256": "0123456789abcdef77"}},
+    "num_ok": 2,
+    "table": [row("model", 20.5), row("retrieval", 99.0), row("billboard", 17.0)]
+    + [row("model", 38.0, "input")],
+}
+SHAPES = {"mean": {"chamfer": 0.04321, "normal_consistency": 0.7, "iou": 0.5}}
+
+
+def cells(table):
+    return [[cell.strip() for cell in line.strip("| ").split("|")] for line in table.splitlines()]
+
+
+def test_the_means_are_of_new_views_and_the_shapes_stand_with_the_model():
+    head, _, *rows = cells(scanned.figures(VIEWS, SHAPES).partition("\n\n")[0])
+    assert head[0] == "2 objects" and head[-3:] == ["Chamfer", "normals", "Volume IoU"]
+    assert rows == [
+        ["**this project**", "20.50", "0.800", "–", "0.500", "0.0432", "0.700", "0.500"],
+        ["billboard", "17.00", "0.800", "–", "0.500", "–", "–", "–"],
+    ]
+    assert scanned.figures(VIEWS, SHAPES).endswith("`m.safetensors`, SHA-256 0123456789abcdef.")
+
+
+SCRIPT = ROOT / "docs" / "examples" / "slurm.sh"
+ARRAY = SCRIPT.with_name("slurm_array.sh")
+PAGE = (ROOT / "docs" / "train-your-own.md").read_text(encoding="utf-8")
+
+
+def slurm(folder, *arguments, script=SCRIPT, **more):
+    """Run a script with stand-ins for scontrol and srun that print their arguments."""
+    for name, text in (("scontrol", "printf 'node7\\nnode8\\n'"), ("srun", 'printf "%s\\n" "$@"')):
+        (folder / name).write_text(f"#!/bin/bash\n{text}\n")
+        (folder / name).chmod(0o755)
+    place = {"PATH": f"{folder}:{os.environ['PATH']}", "SLURM_JOB_ID": "41234"}
+    place |= {"SLURM_JOB_NODELIST": "node[7-8]", "SLURM_NNODES": "2", **more}
+    command = ["bash", str(script), *arguments]
+    return subprocess.run(command, env=place, capture_output=True, text=True, timeout=60)
+
+
+def test_the_slurm_script_starts_torchrun_on_each_machine(tmp_path):
+    done = slurm(tmp_path, "my data", "my run", "--lr", "0.002")
+    assert done.returncode == 0, done.stderr
+    words = done.stdout.splitlines()
+    assert words[:2] == ["--kill-on-bad-exit=1", "torchrun"] and words[-2:] == ["--lr", "0.002"]
+    own = words[words.index("gamba_warp.train") + 1 :]
+    assert own[:3] == ["my data", "--out", "my run"]
+    for name, value in (("--nnodes", "2"), ("--rdzv-endpoint", "node7:21234")):
+        assert words[words.index(name) + 1] == value
+    # The page's own command has the same options.
+    shown = re.search(r"torchrun --nnodes 2.*?```", PAGE, re.DOTALL)
+    assert shown
+    for word in own[3:-2]:
+        assert word in shown[0].split(), word
+    missing = slurm(tmp_path, "my data")
+    assert missing.returncode == 2 and missing.stderr.startswith("usage:")
+
+
+def test_the_tasks_of_an_array_take_their_parts(tmp_path):
+    task = {"script": ARRAY, "SLURM_ARRAY_TASK_ID": "3", "SLURM_ARRAY_TASK_COUNT": "16"}
+    done = slurm(tmp_path, "data", "render", "my meshes", "--out", "DATA", **task)
+    wanted = ["gamba", "data", "render", "my meshes", "--out", "DATA", "--shard", "3/16"]
+    assert done.stdout.splitlines() == wanted, done.stderr
+    task |= {"SLURM_ARRAY_TASK_COUNT": "1", "PARTS": "8"}  # one task again, of eight
+    done = slurm(tmp_path, "data", "render", "MESHES", "--out", "DATA", **task)
+    assert done.stdout.split()[1:] == "data render MESHES --out DATA --shard 3/8".split()
+    assert slurm(tmp_path, "data", **task).returncode == 2

@@ -1,7 +1,5 @@
-"""Features that macOS lacks, taken away on the machine of the tests, and text encodings."""
+"""Features that macOS lacks, taken away on the machine of the tests; set-up, versions and CI."""
 
-import ast
-import configparser
 import os
 import re
 import sys
@@ -10,27 +8,18 @@ from pathlib import Path
 import pytest
 import torch
 import warp as wp
+from helpers.children import ran
 from helpers.refusals import refused
 
+from gamba_warp import devices
 from gamba_warp.errors import UserError
-from gamba_warp.files import only_process, write_json
+from gamba_warp.files import only_process
 from gamba_warp.kernels.runtime import launch, memory, system
 from gamba_warp.kernels.selective_scan import selective_scan
 from gamba_warp.untrusted import children
 from gamba_warp.vision.weights import cache_folder, store_weights
 
 ROOT = Path(__file__).resolve().parents[2]
-FOLDERS = {
-    "gamba_warp": "gamba_warp",
-    "kernels": "gamba_warp.kernels",
-    "train": "gamba_warp.train",
-    "eval": "gamba_warp.eval",
-}
-
-
-def test_json_ends_its_lines_alike_everywhere(tmp_path):
-    write_json(tmp_path / "a.json", ["ä"])
-    assert (tmp_path / "a.json").read_bytes() == b'[\n  "\\u00e4"\n]\n'
 
 
 wp.init()  # its libraries are found before ctypes is patched
@@ -104,48 +93,77 @@ def test_a_lock_that_is_a_link_is_not_followed(tmp_path):
     assert (tmp_path / "target").read_bytes() == b"precious"
 
 
-def _text_without_encoding(path: Path) -> list[int]:
-    """Lines that open text in an encoding that differs between systems."""
-    lines = []
-    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
-        if not isinstance(node, ast.Call):
-            continue
-        name = ast.unparse(node.func).rpartition(".")[2]
-        given = {keyword.arg for keyword in node.keywords}
-        if name in ("run", "Popen") and {"text", "universal_newlines"} & given - {"encoding"}:
-            lines += [] if "encoding" in given else [node.lineno]
-        method = isinstance(node.func, ast.Attribute)
-        if name in ("open", "fdopen") and ast.unparse(node.func) in ("open", "os.fdopen"):
-            mode = ast.unparse(node.args[1]) if len(node.args) > 1 else ""
-            lines += [] if "b" in mode or {"encoding", None} & given else [node.lineno]
-        if method and name in ("read_text", "write_text") and "encoding" not in given:
-            lines.append(node.lineno)
-    return lines
-
-
-def test_text_has_an_encoding(tmp_path):
-    wrong = 'open("a")\nopen("a", "rb")\np.read_text()\np.write_text(x)\nrun(a, text=True)\n'
-    (tmp_path / "a.py").write_text(wrong, encoding="utf-8")
-    assert _text_without_encoding(tmp_path / "a.py") == [1, 3, 4, 5]
-    files = [path for folder in FOLDERS for path in (ROOT / folder).rglob("*.py")]
-    found = {path: _text_without_encoding(path) for path in files}
-    assert not {path: lines for path, lines in found.items() if lines}
-
-
-def test_every_package_is_listed():
-    config = configparser.ConfigParser()
-    config.read(ROOT / "setup.cfg")
-    folders = {
-        ".".join((package, *path.parent.relative_to(ROOT / folder).parts))
-        for folder, package in FOLDERS.items()
-        for path in (ROOT / folder).rglob("*.py")
-    }
-    # The shipped model: files, and no code.
-    assert set(config["options"]["packages"].split()) == folders | {"gamba_warp.starter"}
-
-
 def test_modules_are_not_imported_by_their_folders_names():
     by_folder = re.compile(r"^ *(from|import) (kernels|train|eval)\b", re.M)
-    for folder in (*FOLDERS, "tests", "docs"):
+    for folder in ("gamba_warp", "kernels", "train", "eval", "tests", "docs"):
         for path in (ROOT / folder).rglob("*.py"):
             assert not by_folder.search(path.read_text(encoding="utf-8")), path
+
+
+def test_the_continuous_integration_trusts_no_tag_and_may_only_read():
+    for path in sorted((ROOT / ".github" / "workflows").glob("*.yml")):
+        text = path.read_text()
+        actions = re.findall(r"uses: *(.*)", text)
+        assert actions and "\npermissions:\n  contents: read\n" in text, path
+        assert text.count("permissions:") == 1 and "persist-credentials: false" in text, path
+        for action in actions:
+            assert re.fullmatch(r"\S+@[0-9a-f]{40} # v\d+\.\d+\.\d+", action), action
+
+
+@pytest.mark.parametrize(
+    ("load", "chosen", "want"),
+    [
+        (1.5, {}, "1000"),
+        (0.2, {}, None),
+        (1.5, {"GOMP_SPINCOUNT": "77"}, "77"),
+        (1.5, {"OMP_WAIT_POLICY": "active"}, None),
+    ],
+)
+def test_threads_sleep_where_the_cores_are_busy(monkeypatch, load, chosen, want):
+    for name in ("GOMP_SPINCOUNT", "OMP_WAIT_POLICY"):
+        monkeypatch.setenv(name, "x")  # so that it is as before in the end, whatever is set
+        monkeypatch.delenv(name)
+    for name, value in chosen.items():
+        monkeypatch.setenv(name, value)
+    monkeypatch.delitem(sys.modules, "torch")
+    monkeypatch.setattr(os, "getloadavg", lambda: (load, 0.0, 0.0), raising=False)
+    monkeypatch.setattr(devices, "cores", lambda: 2)
+    devices.share_cores()
+    assert os.environ.get("GOMP_SPINCOUNT") == want
+
+
+def test_what_torch_has_read_already_is_not_changed(monkeypatch):
+    monkeypatch.delenv("GOMP_SPINCOUNT", raising=False)
+    monkeypatch.setattr(os, "getloadavg", lambda: (99.0, 0.0, 0.0), raising=False)
+    assert "torch" in sys.modules or __import__("torch")
+    devices.share_cores()
+    assert "GOMP_SPINCOUNT" not in os.environ
+
+
+def commands(folder: Path, *words: str) -> str:
+    """Everything that ``make WORDS`` would run where nothing is installed yet."""
+    command = ["make", "--dry-run", f"VENV={folder / 'none'}", *words]
+    done = ran(*command, cwd=ROOT, env={**os.environ, "MAKEFLAGS": ""})
+    assert done.returncode == 0, done.stderr
+    return done.stdout
+
+
+@pytest.mark.parametrize("target", ["setup", "demo"])
+def test_a_user_installs_no_tools_of_developers(target, tmp_path):
+    said = commands(tmp_path, target)
+    assert "--editable '.[all]'" in said and "[test]" not in said
+    assert "--quiet" not in said, "each step has its line, and downloads pip's bars"
+    assert "pip fetches" in said
+
+
+@pytest.mark.parametrize("target", ["test", "lint", "docs", "format", "hostile", "endurance"])
+def test_tests_and_checks_add_their_tools(target, tmp_path):
+    said = commands(tmp_path, target)
+    tools = said.index("--editable '.[test]'")
+    assert said.index("--editable '.[all]'") < tools < said.rindex(str(tmp_path / "none"))
+
+
+def test_a_locked_set_up_has_the_versions_of_constraints(tmp_path):
+    assert "--constraint" not in commands(tmp_path, "test")
+    locked = commands(tmp_path, "test", "LOCKED=1")
+    assert locked.count("--constraint constraints.txt --editable") == 2

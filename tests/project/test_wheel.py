@@ -91,10 +91,11 @@ def test_an_installed_wheel_reconstructs_its_own_image(fresh, tmp_path):
     assert where.returncode == 0, where.stderr
     assert all(Path(place).is_relative_to(site) for place in where.stdout.split())
     quick = ("--size", 32, "--frames", 3, "--out", tmp_path / "out")
-    done = run("gamba", "reconstruct", image, *quick)
+    done = run("gamba", "reconstruct", image, *quick, "--sheet", tmp_path / "sheet.png")
     assert done.returncode == 0, done.stderr
     names = {path.name for path in (tmp_path / "out").iterdir()}
     assert names >= {f"scopia-toaster.{end}" for end in ("ply", "gif", "html")}
+    assert (tmp_path / "sheet.png").exists()
     none = run("gamba", "reconstruct")
     assert none.returncode == 2 and f"such as {site}" in none.stderr
     mesh = run("gamba", "reconstruct", image, "--mesh", "obj", *quick)
@@ -125,9 +126,13 @@ def test_the_wheel_holds_the_model_its_card_two_images_and_whose_they_are(wheel)
     assert own - icons == {"ATTRIBUTION.md", "rays.json", "rays.safetensors"}
     assert card["steps"] > 0 and len(icons) == 2
     assert all(f"`{Path(icon).stem}`" in text for icon in icons)
-    sources = {
-        str(p.relative_to(ROOT)) for end in ("h", "cuh") for p in ROOT.glob(f"kernels/**/*.{end}")
-    }
-    assert {f"gamba_warp/{name}" for name in sources} <= names
+    for part in ("gamba_warp", "kernels", "train", "eval"):
+        sources = [
+            path for path in (ROOT / part).rglob("*") if path.suffix in (".py", ".h", ".cuh")
+        ]
+        top = ROOT if part == "gamba_warp" else ROOT / "gamba_warp"
+        inside = {str(top.relative_to(ROOT) / path.relative_to(ROOT)) for path in sources}
+        assert inside <= names, inside - names
+    assert "gamba_warp/py.typed" in names
     assert wheel.stat().st_size < 12e6
     assert not any("tests" in name.split("/") for name in names)

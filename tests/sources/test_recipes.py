@@ -9,9 +9,13 @@ from pathlib import Path
 import pytest
 import tyro
 from helpers import micro
+from helpers.micro import MODEL, lines
+from helpers.published.gobjaverse import write_object
 from helpers.refusals import refused, refused_command
 
 from gamba_warp import cli
+from gamba_warp.cli import run
+from gamba_warp.data.dataset import split_of
 from gamba_warp.model.config import PRESETS
 from gamba_warp.train import command, optim, step
 from gamba_warp.train.command import expand
@@ -148,18 +152,7 @@ def test_the_small_models_recipe_is_its_command():
 def test_the_recipe_takes_data_without_depth(tmp_path, capsys):
     data = micro.write_dataset(tmp_path / "data")
     words = [str(data), "--recipe", "rays", "--set", *micro.MODEL, "ray_cells=4", "ray_features=8"]
-    words += [
-        "--batch-size",
-        "2",
-        "--steps",
-        "1",
-        "--size",
-        "16",
-        "--lpips",
-        "off",
-        "--procedural",
-        "0",
-    ]
+    words += "--batch-size 2 --steps 1 --size 16 --lpips off --procedural 0".split()
     words += ["--lpips-crop", "0", "--device", "cpu", "--out", str(tmp_path / "run")]
     assert cli.run("train", words) == 0
     assert "has no depth images (gamba data render --depth): its" in capsys.readouterr().out
@@ -207,3 +200,23 @@ def test_one_of_several_processes_says_it(monkeypatch, capsys):
         monkeypatch.setenv("RANK", rank)
         command.announce(words)
         assert capsys.readouterr().out.count("recipe rays: ") == count
+
+
+def test_a_copy_of_gobjaverse_trains(tmp_path):
+    names = [f"0/{number}" for number in range(10010, 10040)]
+    chosen = [n for n in names if split_of(n) == "train"][:2]
+    chosen += [n for n in names if split_of(n) == "val"][:1]
+    for name in chosen:  # a choice of objects is a folder of links (docs/data.md)
+        write_object(tmp_path / "set" / name)
+        (tmp_path / "data" / name).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / "data" / name).symlink_to(tmp_path / "set" / name)
+    words = [tmp_path / "data", "--recipe", "paper", "--accumulate", 128]
+    # A small model instead of the paper's, without downloaded weights.
+    words += ["--preset", "tiny", "--set", *MODEL, "--size", 16, "--lpips", "off", "--steps", 1]
+    words += ["--precision", "float32", "--device", "cpu", "--log-every", 1]
+    assert run("train", [str(word) for word in [*words, "--out", tmp_path / "run"]]) == 0
+    record = lines(tmp_path / "run", "train")[-1]
+    assert record["loss_rdist"] > 0 and record["loss"] > 0
+    config = json.loads((tmp_path / "run" / "config.json").read_text())
+    assert config["views"]["batch_size"] * config["views"]["accumulate"] == 256
+    assert config["run"]["recipe"] == "paper"

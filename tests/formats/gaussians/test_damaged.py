@@ -69,12 +69,6 @@ def test_empty_missing_and_a_folder(tmp_path, kind):
     refused(path)
 
 
-def test_another_file(tmp_path):
-    path = tmp_path / "a.txt"
-    path.write_bytes(b"some text")
-    refused(path, "not one of .obj")
-
-
 @pytest.mark.parametrize("wrong", [299, 301, 10_000_000, 2**32 - 1])
 def test_an_spz_with_a_false_count(sound, wrong):
     path, data = sound("spz")

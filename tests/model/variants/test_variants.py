@@ -25,6 +25,7 @@ STORED = {
 NEW = ("mixer", "attention_heads", "attention_mlp", "mixed_tokens")
 NEW += ("triplane_size", "triplane_features", "image_tokens", "num_orders", "ray_back")
 NEW += ("final_norm", "scan_orders", "encoder_resize", "position_weights", "scale_factor")
+NEW += ("decoder", "ray_cells", "ray_layers", "ray_features", "ray_hidden", "ray_coarse")
 VARIANTS = [
     {"mixer": "attention", "attention_heads": 2},
     {"mixer": "attention", "attention_mlp": 1, "norm": "rms", "prepend": False},

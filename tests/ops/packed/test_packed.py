@@ -10,7 +10,7 @@ from helpers.kernels import conv_inputs
 from helpers.scan import gradients, leaves, make
 
 from gamba_warp.kernels.causal_conv1d import causal_conv1d, causal_conv1d_fn
-from gamba_warp.kernels.runtime.packed import count_slots, pieces, sequences
+from gamba_warp.kernels.runtime.packed import sequences
 from gamba_warp.kernels.selective_scan import selective_scan, selective_scan_state
 from gamba_warp.kernels.selective_scan.cuda import launch as cuda
 
@@ -203,27 +203,6 @@ def test_padding_of_causal_conv1d():
     assert (out[..., 6:] == 0).all() and (t.grad[..., 6:] == 0).all()
     want = causal_conv1d_fn(t[..., 3:6], x["weight"], x["bias"])
     assert torch.equal(out[..., 3:6], want)
-
-
-def test_pieces_cover_each_token_once():
-    torch.manual_seed(1)
-    for tokens in (1, 4, 16):
-        for _ in range(20):
-            lengths = (torch.randint(0, 40, (9,)) * torch.randint(0, 2, (9,))).tolist()
-            length = sum(lengths)
-            rows = sequences(torch.empty(1, length, 1), borders(lengths), None)
-            found = pieces(rows, 1, length, tokens)
-            assert len(found) == count_slots(rows, 1, length, tokens)
-            assert all(t0 < end for _, _, end, t0, s in found.tolist() if s >= 0), "none is empty"
-            seen = [
-                (s, t)
-                for _, _, end, t0, s in found.tolist()
-                if s >= 0
-                for t in range(t0, min(t0 + tokens, end))
-            ]
-            assert seen == [
-                (s, t) for s, (_, i, j) in enumerate(rows.tolist()) for t in range(i, j)
-            ]
 
 
 @pytest.mark.parametrize(

@@ -5,15 +5,14 @@ import torch
 from helpers import on_threads
 from helpers.raster import NAMES, leaves, make
 
-from gamba_warp.kernels.rasterize import Skip, autograd, projection, rasterization
+from gamba_warp.kernels.rasterize import Skip, autograd, rasterization
 from gamba_warp.kernels.rasterize.cpu import bin as bin_cpu
-from gamba_warp.kernels.rasterize.cpu import composite as composite_cpu
-from gamba_warp.kernels.rasterize.cpu.project import project_on_lanes, vjp_on_lanes
+from gamba_warp.kernels.rasterize.cpu.project import vjp_on_lanes
 from gamba_warp.kernels.rasterize.cuda import bin as bin_cuda
-from gamba_warp.kernels.rasterize.cuda.project import project_on_threads, vjp_on_threads
-from gamba_warp.kernels.rasterize.projection import Projected, ProjectionOptions, projection_params
+from gamba_warp.kernels.rasterize.cuda.project import vjp_on_threads
+from gamba_warp.kernels.rasterize.projection import Projected
 from gamba_warp.kernels.rasterize.skip import TILE_TEST
-from gamba_warp.kernels.rasterize.tiles import Splats2D, Tiling, make_grid
+from gamba_warp.kernels.rasterize.tiles import Tiling, make_grid
 
 LISTS = ("pairs", "starts")
 
@@ -103,18 +102,6 @@ def test_lists_are_in_order_of_depth_then_of_index(monkeypatch):
     assert (key.diff() == 0)[same].float().mean() > 0.5
 
 
-def test_pairs_are_numbered_by_gaussian(monkeypatch):
-    """The rows of a Gaussian are adjacent, from its offset on; the sums of rows rely on that."""
-    monkeypatch.setattr(bin_cpu, "MANY", 0)
-    bins = rasterization(**make(2, 2, 150, 50, 70))[2].bins
-    total = len(bins.pairs)
-    assert torch.equal(bins.rows.sort().values, torch.arange(total, dtype=torch.int32))
-    owners = torch.empty_like(bins.pairs)
-    owners[bins.rows.long()] = bins.pairs
-    assert torch.equal(owners, bins.order.repeat_interleave(bins.offsets.diff()))
-    assert bins.offsets[0] == 0 and bins.offsets[-1] == total
-
-
 @pytest.mark.parametrize("many", [0, 1 << 30])
 def test_repeatable_with_any_number_of_threads(monkeypatch, many):
     monkeypatch.setattr(bin_cpu, "MANY", many)
@@ -123,99 +110,6 @@ def test_repeatable_with_any_number_of_threads(monkeypatch, many):
     for threads in (1, 2, 2, 5):
         with on_threads(threads):
             assert_same(want, call(scene, render_mode="RGB+ED"))
-
-
-def projected(gaussians, colors, **changes):
-    """The inputs, parameters and projection on lanes, which is that on threads to the bit."""
-    viewmats = torch.eye(4).repeat(2, 3, 1, 1)
-    viewmats[..., :3, :3] = torch.linalg.qr(torch.randn(2, 3, 3, 3))[0]
-    viewmats[..., 2, 3] = 2.0
-    Ks = torch.tensor([[300.0, 0, 130], [0, 310.0, 110], [0, 0, 1]]).repeat(2, 3, 1, 1)
-    options = dict(width=257, height=203, near_plane=0.5, far_plane=4.0, radius_clip=0.0)
-    options |= dict(eps2d=0.3, alpha_min=1 / 255, antialiased=0, skip_unused=1)
-    params = projection_params(ProjectionOptions(**options | changes))
-    inputs = [*gaussians, colors, viewmats, Ks]
-    got = projection.project_forward(inputs, params, project_on_lanes)
-    want = projection.project_forward(inputs, params, project_on_threads)
-    for name, value in want._asdict().items():
-        assert torch.equal(getattr(got, name), value), name
-    assert len(got.status.unique()) >= (5 if gaussians[0].shape[1] > 300 else 3)
-    return inputs, params, got
-
-
-@pytest.mark.parametrize(
-    "num, rotated, antialiased, rounded, channels",
-    [(1037, True, 0, 0, 3), (530, True, 1, 0, 1), (77, False, 0, 1, 5), (9, True, 0, 0, 18)],
-)
-def test_projection_on_lanes(num, rotated, antialiased, rounded, channels):
-    means, scales = torch.randn(2, num, 3), torch.exp(torch.randn(2, num, 3) - 3.5)
-    quats, opacities = torch.randn(2, num, 4), torch.rand(2, num)
-    colors = torch.rand(2, num, channels)
-    if rotated and channels == 3:
-        quats[:, :20] = 0
-        for x in (means, quats, scales, opacities, colors):
-            bad = torch.tensor([torch.nan, torch.inf, -torch.inf, 1e30, 1e-30, 0.0]).repeat(2)
-            x.view(-1)[torch.randperm(x.numel())[: len(bad)]] = bad
-    gaussians = means, quats if rotated else None, scales, None, opacities
-    projected(gaussians, colors, radius_clip=1.5, antialiased=antialiased, rounded=rounded)
-
-
-@pytest.mark.parametrize("original, antialiased", [(0, 0), (0, 1), (1, 0), (1, 1)])
-@pytest.mark.parametrize("shape", ["covars", "quats", "scales"])
-def test_projection_of_covariances_and_of_the_original_on_lanes(shape, original, antialiased):
-    """Also backward, and of covariances that rounding has made indefinite."""
-    num = 331
-    means, scales = torch.randn(2, num, 3), torch.exp(2 * torch.randn(2, num, 3) - 3.5)
-    quats, opacities = torch.randn(2, num, 4), torch.rand(2, num)
-    opacities[:, ::7] = 1e-3
-    root = torch.linalg.qr(torch.randn(2, num, 3, 3))[0] * scales[..., None, :]
-    covars = (root @ root.mT)[..., [0, 0, 0, 1, 1, 2], [0, 1, 2, 1, 2, 2]]
-    covars[:, :30, 3:] = covars[:, :30, :3]  # of no Gaussian
-    covars[:, 30:35], covars[0, 35, 2] = 0.0, torch.nan
-    given = {"covars": (None, None, covars), "quats": (quats, scales, None)}
-    gaussians = means, *given.get(shape, (None, scales, None)), opacities
-    options = {"original": original, "antialiased": antialiased}
-    inputs, params, got = projected(gaussians, torch.rand(2, num, 3), **options)
-    v = [torch.randn_like(x) for x in got[:4]]
-    wanted = [x is not None for x in gaussians] + [True]
-    kept = [*gaussians, *inputs[-2:]], params, got.conics, got.status, v, wanted
-    of_lanes, of_threads = (
-        projection.project_backward(*kept, run) for run in (vjp_on_lanes, vjp_on_threads)
-    )
-    names = "means quats scales covars opacities viewmats".split()
-    for name, a, b in zip(names, of_lanes, of_threads):
-        assert (a is None and b is None) or (torch.equal(a, b) and (a != 0).any()), name
-    alone = [True, *[False] * 5]
-    for run in (vjp_on_lanes, vjp_on_threads):
-        assert torch.equal(projection.project_backward(*kept[:-1], alone, run)[0], of_lanes[0])
-
-
-def sums_one_by_one(v_pairs, written, splats, bins, geometry, absolute):
-    """Row after row in float32, and README eq. 11 with every product rounded."""
-    _, conics, view_opacities, _ = splats
-    sums = torch.zeros(bins.order.numel(), v_pairs.shape[1])
-    firsts = bins.offsets.tolist()
-    for i, begin, end in zip(bins.order.tolist(), firsts, firsts[1:]):
-        for p in range(begin, end):
-            if written[p]:
-                sums[i] += v_pairs[p]
-    sums = sums.view(*view_opacities.shape, -1)
-    h, hu, hy, huu, huy, hyy = sums[..., :6].unbind(-1)
-    a, k, e = conics.unbind(-1)
-    v_means2d = torch.stack([a * hu, a * k * hu + e * hy], -1)
-    v_conics = torch.stack([-0.5 * huu, -a * huy, -0.5 * hyy], -1)
-    v_opacities = torch.where(h != 0, h / view_opacities, 0.0)
-    assert geometry and absolute is None
-    return Splats2D(v_means2d, v_conics, v_opacities, sums[..., 6:].contiguous())
-
-
-@pytest.mark.parametrize("channels", [1, 3, 10, 11, 20])
-def test_sums_of_rows(monkeypatch, channels):
-    """To the bit, for rows that are lanes (to ten channels) and for wider ones."""
-    scene = make(1, 2, 150, 50, 70, channels=channels)
-    got = call(scene)
-    monkeypatch.setattr(composite_cpu, "reduce_rows", sums_one_by_one)
-    assert_same(call(scene), got)
 
 
 @pytest.mark.parametrize("mode", ["classic", "antialiased"])

@@ -1,13 +1,19 @@
-"""Launches on CUDA after a kernel's first, without a GPU: what they hand to Warp."""
+"""Launches: of CUDA without a GPU, of C++ headers, and in Warp's debug mode."""
 
 import ctypes
+import os
+import sys
 import threading
+from pathlib import Path
 
 import pytest
 import torch
 import warp as wp
+from helpers.children import ran
 
 from gamba_warp.kernels.runtime import launch as launches
+from gamba_warp.kernels.runtime.launch import parallel_launch
+from gamba_warp.kernels.runtime.native import constants, native, native_kernel
 
 wp.set_module_options({"enable_backward": False})
 CUDA = torch.device("cuda")
@@ -102,3 +108,53 @@ def test_another_warp_launches_as_it_does(handed, monkeypatch, lacks):
         call(torch.randn(3), count, (3, 2))
     assert len(handed) == 2 and not launches._entries
     assert ctypes.sizeof(handed[-1][1][0]) > 0
+
+
+def test_a_function_of_a_header_is_a_kernel_and_its_text_decides_the_module(tmp_path):
+    path, part = tmp_path / "scale.h", tmp_path / "part.h"
+    path.write_text(
+        '#include "part.h"\n#include "part.h"\n'  # once, as it defines a function
+        "template<class Config, class In, class Out>\n"
+        "static void scale(int task, const In& in, const Out& out) {\n"
+        "    out.y.data[task] = times<Config>(in.x.data[task]) + in.shift;\n"
+        "}\n"
+    )
+    part.write_text(
+        "template<class Config> static float times(float x) {\n"
+        "    return Config::ODD ? x * Config::HALF : x * Config::TERM;\n"
+        "}\n"
+    )
+
+    def kernel():
+        header = native(path) + constants("Config", TERM=2, HALF=0.5, ODD=True)
+        inputs = {"x_in": wp.array(dtype=float), "shift": float}
+        call = "scale<Config>"
+        outputs = {"y_out": wp.array(dtype=float)}
+        return native_kernel("scale", call, inputs, outputs, header, grouped=True)
+
+    first, x, y = kernel(), torch.tensor([1.0, 2.0, 4.0]), torch.zeros(3)
+    parallel_launch(first, 3, [x, 0.25], [y], threads=2)
+    assert y.tolist() == [0.75, 1.25, 2.25]
+    assert kernel().module.get_module_hash() == first.module.get_module_hash()
+    part.write_text(part.read_text().replace("HALF", "TERM"))
+    assert kernel().module.get_module_hash() != first.module.get_module_hash()
+
+
+PROGRAM = """
+import ops.debug_mode, torch
+import warp as wp
+from gamba_warp.kernels.runtime.views import view
+from helpers.kernels import plain_kernel
+x, y = torch.zeros(2, 8)
+for room in (7, 6):
+    wp.launch(plain_kernel, 7, [view(x[:7]), view(y[:room])], device="cpu")
+    print("room for", room, flush=True)
+"""
+
+
+def test_a_write_past_the_end_of_an_array_ends_the_process():
+    tests = Path(__file__).parents[2]
+    environment = {**os.environ, "PYTHONPATH": str(tests)}
+    done = ran(sys.executable, "-c", PROGRAM, env=environment)
+    assert done.stdout.endswith("room for 7\n"), done.stdout + done.stderr
+    assert done.returncode < 0 and "i < arr.shape[0]" in done.stderr

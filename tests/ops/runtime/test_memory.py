@@ -67,20 +67,6 @@ def test_the_pool_keeps_its_bound_and_the_newest(pool):
     assert pool.size() == 0
 
 
-def test_the_newest_stay_touched_and_older_blocks_are_lent():
-    pool = Pool(MOST, 5 * LARGE)  # a block of 2 LARGE has a page more, so two of them stay
-    held = [pool.take(2 * LARGE).fill_(1) for _ in range(3)]
-    first, last = held[0].data_ptr(), held[-1].data_ptr()
-    while held:
-        held.pop(0)
-    assert [block.lent for block in pool._free] == [True, False, False]
-    held = [pool.take(2 * LARGE) for _ in range(3)]
-    assert [x.data_ptr() for x in held[::2]] == [last, first]
-    held.pop()
-    assert [block.lent for block in pool._free] == [False]
-    assert pool.take(2 * LARGE).eq(1).all()  # nobody took its pages
-
-
 def test_threads_never_share_a_block(pool):
     wrong = []
 

@@ -1,7 +1,6 @@
 """``gamba stress``: a short run, limits that can fail, and failing cases that are made smaller."""
 
 import json
-from dataclasses import replace
 
 import hypothesis
 import pytest
@@ -10,11 +9,7 @@ from helpers import assert_rel_rms
 
 from gamba_warp import cli
 from gamba_warp.kernels.cases import conv, raster, scan
-from gamba_warp.kernels.cases import scan_oracle as oracle
 from gamba_warp.kernels.cases.random_case import RandomCase, run_case
-from gamba_warp.kernels.cases.rounding import Rounding, samples_of
-from gamba_warp.kernels.causal_conv1d.reference import causal_conv1d_reference
-from gamba_warp.kernels.rasterize.reference import rasterization_reference
 from gamba_warp.kernels.selective_scan import selective_scan_fn, selective_scan_state
 from gamba_warp.kernels.selective_scan.reference import selective_scan_reference
 from gamba_warp.kernels.stress import run as stress
@@ -78,71 +73,6 @@ def test_a_short_run_passes_and_is_the_same_again(name):
         rows = [{k: v for k, v in row.items() if k != "seconds"} for row in run.document()["rows"]]
         runs.append(rows)
     assert runs[0] == runs[1] and sum(row["cases"] for row in runs[0]) >= 3
-
-
-@pytest.mark.parametrize("discretization", scan.DISCRETIZATIONS)
-def test_scan_oracle_is_the_reference(discretization):
-    case = RandomCase("scan", "uniform", 5, scan.OP.plain | dict(
-        batch=2, length=29, channels=6, states=3, groups=2, use_D=True, use_z=True, use_bias=True,
-        use_state=True, softplus=True,
-    ))  # fmt: skip
-    inputs = scan.build(case, CPU)
-    samples = {k: samples_of(x) for k, x in inputs.items()}
-    out, last = oracle.scan(samples, True, discretization, Rounding(0))
-    doubles = {k: x.detach().double().requires_grad_() for k, x in inputs.items()}
-    want, want_last = selective_scan_reference(
-        **doubles, delta_softplus=True, discretization=discretization
-    )
-    v, v_last = torch.randn_like(want), torch.randn_like(want_last)
-    grads = torch.autograd.grad((out * v).sum() + (last * v_last).sum(), [*samples.values()])
-    wants = torch.autograd.grad((want * v).sum() + (want_last * v_last).sum(), [*doubles.values()])
-    pairs = [("out", out, want), ("last", last, want_last)]
-    for name, got, expected in (*pairs, *zip(inputs, grads, wants)):
-        # float64, and a softplus that is the identity above 20 in the reference
-        assert_rel_rms(got[0], expected, 1e-12, name)
-        spread = (got[1:] - got[0]).abs().amax() / expected.abs().amax()
-        assert 1e-8 < spread < 1e-5, f"{name}: the samples are {spread:.1e} off"
-
-
-def test_conv_oracle_is_the_reference():
-    case = RandomCase("conv", "normal", 5, conv.OP.plain | dict(
-        batch=2, length=9, channels=6, width=4, silu=True, use_bias=True, use_state=True
-    ))  # fmt: skip
-    inputs = conv.build(case, CPU)
-    samples = {k: samples_of(x) for k, x in inputs.items()}
-    got = oracle.conv(samples, True, torch.float32, Rounding(0))
-    doubles = {k: x.detach().double() for k, x in inputs.items()}
-    want = causal_conv1d_reference(**doubles, activation="silu")
-    for name, a, b in zip(("out", "final"), got, want):
-        assert_rel_rms(a[0], b, 1e-14, name)
-
-
-@pytest.mark.parametrize("antialiased", [False, True])
-def test_raster_oracle_is_the_reference(antialiased):
-    case = RandomCase("raster", "uniform", 3, raster.OP.plain | dict(
-        lead="two", views=2, num=20, width=13, height=9, channels=3, backgrounds=True,
-        use_quats=True, mode="RGB+D", antialiased=antialiased,
-    ))  # fmt: skip
-    x = raster.build(case, CPU)
-    leaves = {k: t.double().detach().requires_grad_(k != "Ks") for k, t in x.items()}
-    samples, image = raster.truth(case, x)
-    renders, alphas = image.blended.split([4, 1], -1)
-    color, depth, alpha = rasterization_reference(
-        **leaves, width=13, height=9, antialiased=antialiased
-    )
-    want = torch.cat([color, depth], -1)
-    assert_rel_rms(renders[0], want, 1e-12, "renders")
-    assert_rel_rms(alphas[0], alpha, 1e-12, "alphas")
-    assert alphas[0].mean() > 0.1 and image.undecided.double().mean() < 0.02
-    v, v_alpha = torch.randn_like(want), torch.randn_like(alpha)
-    del leaves["Ks"]
-    total = (renders * v).sum() + (alphas * v_alpha).sum()
-    grads = torch.autograd.grad(total, [samples[k] for k in leaves])
-    wants = torch.autograd.grad((want * v).sum() + (alpha * v_alpha).sum(), [*leaves.values()])
-    for name, got, expected in zip(leaves, grads, wants):
-        assert_rel_rms(got[0], expected, 1e-10, name)
-        spread = (got[1:] - got[0]).abs().amax() / expected.abs().amax()
-        assert 1e-8 < spread < 1e-4, f"{name}: the samples are {spread:.1e} off"
 
 
 def test_an_error_of_the_image_is_caught_and_a_flip_is_not(monkeypatch):
@@ -229,16 +159,6 @@ def test_a_small_error_is_caught_and_reported(monkeypatch, tmp_path, broken_scan
     assert failure["text"] in capsys.readouterr().out
 
 
-def test_a_failing_case_is_made_small(monkeypatch, broken_scan):
-    monkeypatch.setattr(stress, "_SHRINK", 300.0)
-    op = replace(scan.OP, kinds={kind: scan.OP.kinds[kind] for kind in ("uniform", "spread")})
-    run = stress.StressRun([op], CPU, seed=0)
-    run.run(60, 1e9)
-    case = RandomCase(**run.failures[0]["case"])
-    changed = {k for k, v in case.options.items() if v != op.plain[k]}
-    assert changed == {"use_z"} and (case.kind, case.seed) == ("uniform", 0)
-
-
 @pytest.mark.parametrize("value, what", [(float("nan"), "not finite"), (None, "fault")])
 def test_not_finite_and_exceptions_are_failures(monkeypatch, value, what):
     right = scan.selective_scan
@@ -261,21 +181,6 @@ def test_two_runs_that_differ_are_a_failure(monkeypatch):
     plain = scan.OP.plain | {"length": 9}
     outcome = run_case(scan.OP, RandomCase("scan", "uniform", 1, plain), CPU)
     assert outcome.faults == ["two runs differ in out"]
-
-
-def test_interrupted_keeps_what_was_found(tmp_path, monkeypatch, capsys):
-    right, count = scan.selective_scan, iter(range(100))
-
-    def interrupted(*arguments, **options):
-        if next(count) == 6:
-            raise KeyboardInterrupt
-        return right(*arguments, **options)
-
-    monkeypatch.setattr(scan, "selective_scan", interrupted)
-    assert exit_code("scan", "--cases", 24, "--out", tmp_path) == 130
-    document = json.loads((tmp_path / "stress.json").read_text())
-    assert document["interrupted"] and 0 < sum(row["cases"] for row in document["rows"]) < 24
-    assert "interrupted" in capsys.readouterr().out
 
 
 def test_constant_input_matrix_sums_its_gradient_in_float32():

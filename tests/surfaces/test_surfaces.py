@@ -10,7 +10,6 @@ import trimesh
 from helpers.refusals import refused
 from helpers.views import cloud_of
 
-from gamba_warp.batch import STAGES
 from gamba_warp.cameras import fibonacci_sphere
 from gamba_warp.errors import UserError
 from gamba_warp.formats.meshes import load_mesh
@@ -241,15 +240,6 @@ def test_what_has_no_surface(method, case, reason):
 def test_one_gaussian_has_a_surface(method):
     surface = extract_surface(at([[0.0, 0, 0]], sigma=0.1), SurfaceOptions(method=method, **QUICK))
     assert 0.05 < np.ptp(surface.vertices, axis=0).max() < 0.6
-
-
-def test_the_stages_have_names(monkeypatch):
-    names = []
-    monkeypatch.setattr(STAGES, "show", names.append)
-    ball = at([[0.0, 0, 0]], sigma=0.1)
-    extract_surface(ball, SurfaceOptions(colors=True, watertight=True, **QUICK), 64)
-    parts = "views", "surface", "cleaning", "closing", "colors", "texture"
-    assert names == [*(f"mesh {part}" for part in parts), "mesh"]
 
 
 @pytest.mark.parametrize("method", ["tsdf", "density"])
