@@ -207,18 +207,6 @@ def test_sam_comes_before_the_matte(network, busy, monkeypatch):
     assert cut_out(path, options).method == "matte"
 
 
-@pytest.mark.parametrize("soft, reason", [(0.36, None), (0.44, "it has no clear border")])
-def test_a_mask_may_be_soft_in_part(soft, reason):
-    """Of the sum of alpha, at most .4 may lie in pixels that are neither object nor background."""
-    alpha = np.zeros((40, 50), np.float32)
-    alpha[10:30, 10:40] = 0.8  # of 600 pixels
-    flat = alpha[10:30, 10:40].reshape(-1)
-    flat[: round(600 * 0.8 * (1 - soft) / (0.8 * (1 - soft) + soft))] = 1.0
-    alpha[10:30, 10:40] = flat.reshape(20, 30)
-    assert alpha[alpha < 0.9].sum() / alpha.sum() == pytest.approx(soft, abs=0.01)
-    assert cutout.fault_of(alpha) == reason
-
-
 @pytest.mark.parametrize("alpha", [0.35, 0.8])
 def test_an_object_that_is_soft_everywhere_is_spoken_of(tmp_path, alpha):
     rgba = np.zeros((40, 50, 4))
