@@ -70,6 +70,20 @@ def test_a_wrong_result_fails(monkeypatch, tmp_path, capsys):
     assert "conv: operator: default, forward: check failed" in capsys.readouterr().out
 
 
+@pytest.mark.parametrize("tests, bench, code", [(1, 1, 0), (0, 1, 1), (1, 0, 1)])
+def test_both_parts_must_pass(monkeypatch, tmp_path, tests, bench, code):
+    given = []
+
+    def part(name, words, log, seconds):
+        given.append((name, seconds))
+        return bool({"tests": tests, "bench": bench}[name])
+
+    monkeypatch.setattr(gpu_check, "run_part", part)
+    assert main(["--device", "cpu", "--minutes", "2", "--out", str(tmp_path)]) == code
+    assert [name for name, _ in given] == ["tests", "bench"]
+    assert given[0][1] == 60 and 90 < given[1][1] <= 100  # less what a part may take to end
+
+
 ANOTHER = """
 import pathlib, subprocess, sys, time
 child = subprocess.Popen([sys.executable, "-c", "import time; time.sleep(60)"])

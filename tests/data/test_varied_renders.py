@@ -13,6 +13,7 @@ from gamba_warp.data.dataset import open_dataset, split_of
 from gamba_warp.errors import UserError
 from gamba_warp.formats.meshes import load_mesh
 from gamba_warp.train.data.poses import FRONT, front_views, look_at_origin, sample_poses
+from gamba_warp.train.data.raycast import Lights
 
 QUICK = {"views": 3, "size": 17, "workers": 1}
 
@@ -101,6 +102,14 @@ def test_views_from_the_front_are_found_by_their_poses():
     ):
         pair = np.stack([look_at_origin(90, 80, 2.0), look_at_origin(azimuth, elevation, 2.0)])
         assert front_views(pair) == ([0, 1] if front else [0])
+
+
+def test_varied_lights_differ_more():
+    def strengths(varied):
+        drawn = [Lights.sample(np.random.default_rng(seed), varied) for seed in range(60)]
+        return np.array([light.ambient[0] for light in drawn])
+
+    assert np.std(strengths(True)) > 2 * np.std(strengths(False))
 
 
 def test_normals_of_a_stretched_mesh_stay_across_its_faces(tmp_path):

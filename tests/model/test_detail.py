@@ -185,6 +185,21 @@ def test_no_crack_opens_from_the_side():
         assert (other - one).abs().mean() < 0.02
 
 
+def test_children_go_half_of_the_way_that_parents_lie_off_their_rays():
+    model, rgba = fresh(), board(48, 2)
+    with torch.inference_mode():
+        image, camera = model_input(rgba, model.config), reference_cameras(model.config, 1)
+        found = []
+        for off in (0.0, 0.004):
+            made = model(image, camera)[0]
+            made.means[:, 0] += off
+            split = split_front(made, image[0], rgba, model.config, 2, camera)
+            found.append(split.means[-200:])
+    torch.testing.assert_close(
+        found[1] - found[0], torch.tensor([0.002, 0.0, 0.0]).expand(200, 3), atol=1e-6, rtol=0
+    )
+
+
 def test_children_lie_on_the_rays_of_their_own_pixels(monkeypatch):
     """Except for the fraction of their parent's offset from its ray."""
     monkeypatch.setitem(OFFSET_FRACTION, 2, 0.0)
