@@ -574,6 +574,12 @@ def test_unread_content_is_named(tmp_path, name):
     assert warning in mesh.warnings and len(mesh.faces) == 2
 
 
+def test_names_that_look_like_extensions(tmp_path):
+    document = Document(nodes=[{"mesh": 0, "name": "LP_body"}]).paint()
+    document.attributes["_BATCHID"] = 0
+    assert not document.load(tmp_path).warnings
+
+
 @pytest.mark.parametrize(
     "name", ["KHR_draco_mesh_compression", "EXT_meshopt_compression", "KHR_meshopt_compression"]
 )
