@@ -134,6 +134,23 @@ def test_nothing_of_gsplat_is_missing():
         assert {name for name in names if not hasattr(ours, name)} == set()
 
 
+def test_a_guard_around_the_import_of_another_module(tmp_path, monkeypatch):
+    """Takes its other way where one that is imported there lacks a name."""
+    (tmp_path / "own_layers.py").write_text(
+        "from gamba_warp.compat.mamba_ssm import Mamba2\n\nclass Mine:\n    pass\n"
+    )
+    (tmp_path / "own_models.py").write_text("from own_layers import Mine\n")
+    monkeypatch.syspath_prepend(tmp_path)
+    space: dict = {}
+    path = tmp_path / "client.py"
+    path.write_text(
+        "try:\n    from own_models import Mine\nexcept ImportError:\n    Mine = None\n"
+        "import own_layers\n"
+    )
+    space = runpy.run_path(str(path))
+    assert space["Mine"] is None and space["own_layers"].Mine is not None
+
+
 @pytest.mark.parametrize("argument", [{"bimamba": True}, {"nslices": 64}, {"bimamba_type": "v3"}])
 def test_arguments_of_forks_name_the_way_out(argument):
     (name,) = argument

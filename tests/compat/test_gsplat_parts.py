@@ -1,16 +1,17 @@
 """The lower calls of the gsplat interface against gsplat's own torch functions, by name.
 
 They run on the CPU; ``accumulate``, which blends given pairs of pixels and Gaussians, asks for two
-functions of nerfacc, written in helpers/raster.py.
+functions of nerfacc, written here.
 """
 
 import importlib.util
 import sys
+import types
 
 import pytest
 import torch
 from helpers import assert_rel_rms
-from helpers.raster import leaves, make, mapped, nerfacc, visible_pairs, weights_by_pixel
+from helpers.raster import leaves, make, mapped
 
 from gamba_warp.compat import gsplat as compat
 from gamba_warp.kernels.rasterize.constants import ALPHA_MIN, COMPENSATION_MIN
@@ -18,6 +19,66 @@ from gamba_warp.kernels.rasterize.constants import ALPHA_MIN, COMPENSATION_MIN
 if importlib.util.find_spec("gsplat") is None:
     pytest.skip("needs the package gsplat (pip install gsplat==1.5.3)", allow_module_level=True)
 from gsplat.cuda import _torch_impl as gsplat
+
+
+def weights_by_pixel(means2d, conics, opacities, width, height):
+    """Centres of every pixel by itself ``[H W, N, 2]`` and their weights ``[H W, N]``, in float64.
+
+    Gaussians come front to back; conics are gsplat's xx, xy, yy. The gradient of the centres, a
+    leaf, has a row for each pixel.
+    """
+    y, x = torch.meshgrid(torch.arange(height) + 0.5, torch.arange(width) + 0.5, indexing="ij")
+    each = means2d.detach().double().expand(height * width, *means2d.shape).clone().requires_grad_()
+    d = torch.stack([x, y], -1).view(-1, 1, 2) - each
+    xx, xy, yy = conics.double().unbind(-1)
+    q = xx * d[..., 0] ** 2 + 2 * xy * d[..., 0] * d[..., 1] + yy * d[..., 1] ** 2
+    alpha = (opacities.double() * torch.exp(-0.5 * q)).clamp_max(0.999)
+    alpha = torch.where(alpha >= ALPHA_MIN, alpha, 0.0)
+    after = (1 - alpha).cumprod(1)
+    return each, torch.where(after > 1e-4, after / (1 - alpha) * alpha, 0.0)
+
+
+def nerfacc():
+    """The two functions of nerfacc that gsplat's ``accumulate`` asks for; pairs come ray by ray."""
+
+    def render_weight_from_alpha(alphas, ray_indices, n_rays):
+        order = torch.arange(len(alphas))
+        first = torch.full((n_rays,), len(alphas)).scatter_reduce(
+            0, ray_indices, order, "amin", include_self=True
+        )
+        light = torch.log1p(-alphas)
+        before = torch.cumsum(light, 0) - light
+        transmittances = torch.exp(before - before[first[ray_indices]])
+        return transmittances * alphas, transmittances
+
+    def accumulate_along_rays(weights, values, ray_indices, n_rays):
+        values = weights[:, None] if values is None else weights[:, None] * values
+        return values.new_zeros(n_rays, values.shape[-1]).index_add(0, ray_indices, values)
+
+    module = types.ModuleType("nerfacc")
+    module.render_weight_from_alpha = render_weight_from_alpha
+    module.accumulate_along_rays = accumulate_along_rays
+    return module
+
+
+def visible_pairs(projected, opacities, width, height):
+    """Every (image, pixel, Gaussian) with alpha >= alpha_min, ray by ray and front to back."""
+    _, means2d, depths, conics, _ = projected
+    images, num = depths.flatten(0, 1).shape
+    means2d, conics = means2d.view(images, num, 2), conics.view(images, num, 3)
+    order = torch.argsort(depths.view(images, num), stable=True)
+    parts = []
+    for image in range(images):
+        y, x = torch.meshgrid(torch.arange(height), torch.arange(width), indexing="ij")
+        pixels = torch.stack([x, y], -1).view(-1, 1, 2) + 0.5
+        d = pixels - means2d[image, order[image]]
+        a, b, c = conics[image, order[image]].unbind(-1)
+        q = a * d[..., 0] ** 2 + 2 * b * d[..., 0] * d[..., 1] + c * d[..., 1] ** 2
+        alpha = opacities.reshape(images, num)[image, order[image]] * torch.exp(-0.5 * q)
+        pixel, rank = (alpha >= ALPHA_MIN).nonzero(as_tuple=True)
+        parts.append((order[image][rank], pixel, torch.full_like(pixel, image)))
+    return tuple(torch.cat(p) for p in zip(*parts))
+
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 # float32 against float64: a few hundred roundings. The kernel's factor of antialiasing multiplies

@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from gamba_warp.compat.gsplat import rasterization
-from gamba_warp.compat.gsplat.relocation import compute_relocation
+from gamba_warp.compat.gsplat.relocation import compute_relocation, torch_strategies
 
 ROOT = Path(__file__).resolve().parents[2]
 pytestmark = pytest.mark.usefixtures("one_thread")
@@ -129,6 +129,17 @@ def test_mcmc_strategy(monkeypatch):
     assert (params["opacities"].sigmoid() > 0.004).all(), "the dead ones live elsewhere now"
     assert losses[-1] < 0.5 * losses[0]
     assert ops.compute_relocation is theirs, "what was replaced is put back"
+
+
+@NEEDS_GSPLAT
+def test_torch_strategies_come_back_after_an_error():
+    from gsplat.strategy import ops
+
+    before = ops.compute_relocation, ops.quat_scale_to_covar_preci
+    with pytest.raises(KeyError), torch_strategies():
+        assert ops.compute_relocation is compute_relocation
+        raise KeyError
+    assert before == (ops.compute_relocation, ops.quat_scale_to_covar_preci)
 
 
 @NEEDS_GSPLAT

@@ -6,7 +6,7 @@ from itertools import product
 import pytest
 import torch
 import torch.nn.functional as F
-from helpers import assert_rel_rms
+from helpers import assert_default_dtype_changes_nothing, assert_rel_rms, in_default_float64
 from helpers.mamba import block_in_float64, layer_in_float64, run, scan_in_float64
 
 from gamba_warp.compat import mamba_ssm
@@ -339,3 +339,20 @@ def test_layers_of_one_kind_have_one_result(capsys):
     for line in capsys.readouterr().out.splitlines()[1:]:
         errors = [float(word) for word in line.partition("to the loop ")[2].split(" and ")]
         assert len(errors) == 2 and max(errors) < 2e-6, line
+
+
+def test_float32_layers_where_the_default_is_float64():
+    """The same bits; float64 layers give an error that lists the allowed dtypes."""
+
+    def run():
+        torch.manual_seed(0)
+        layer = Mamba(16, dtype=torch.float32, layer_idx=0)
+        tokens = torch.randn(2, 7, 16, dtype=torch.float32)
+        out = layer(tokens)
+        cache = layer.allocate_inference_cache(2, 0)
+        gradients = torch.autograd.grad(out.sum(), list(layer.parameters()))
+        return [out, *layer.step(tokens[:, :1], *cache), *layer.parameters(), *gradients]
+
+    assert_default_dtype_changes_nothing(run)
+    with pytest.raises(TypeError, match="hidden_states must have dtype.*got torch.float64"):
+        in_default_float64(lambda: Mamba(16)(torch.randn(2, 7, 16)))

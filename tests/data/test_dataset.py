@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 import torch
 from helpers import micro
+from helpers.gobjaverse import ELEVATION, VIEWS, camera, write_object
 from helpers.micro import to_opengl
-from helpers.published.gobjaverse import ELEVATION, VIEWS, camera, write_object
 from helpers.refusals import refused
 from PIL import Image
 

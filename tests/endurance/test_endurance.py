@@ -14,14 +14,11 @@ import numpy as np
 import pytest
 import torch
 from helpers.gaussians import khr_glb, some
-from helpers.released import SIZES, make_released
 from safetensors.torch import save_file
 
-from gamba_warp.cli import run
 from gamba_warp.files import sha256, sha256_of_all
 from gamba_warp.formats.ply import save_ply
 from gamba_warp.images import save_image
-from gamba_warp.model.checkpoint import read_config
 from gamba_warp.train.checkpoint import damage, list_checkpoints
 
 from .child import gamba, run_child
@@ -155,11 +152,3 @@ def test_children_are_killed_and_find_a_full_disk(tmp_path):
     end = run_child(Path.write_bytes, tmp_path / "a", bytes(9999), file_limit=5)
     assert end.code == 1 and "File too large" in end.said
     assert (tmp_path / "a").stat().st_size == 5
-
-
-def test_a_made_up_released_file_is_imported(tmp_path):
-    make_released(tmp_path / "released")
-    name, *words = JOBS["import-released"].words(tmp_path, tmp_path / "out")
-    assert run(name, words) == 0
-    config = read_config(tmp_path / "out" / "model.safetensors")[0]
-    assert {name: getattr(config, name) for name in SIZES} == SIZES

@@ -324,6 +324,17 @@ def test_instances(tmp_path):
     assert len(instanced().load(tmp_path).faces) == 2
 
 
+def test_instances_that_are_not_read(tmp_path):
+    rows = np.ones((2, 3), "<f4")
+    refused("2 x 3 numbers scale", instanced(TRANSLATION=rows[:1], SCALE=rows).load, tmp_path)
+    refused("2 x 3 numbers rotation", instanced(ROTATION=rows).load, tmp_path)
+    document = skinned()
+    given = {"TRANSLATION": document.array(rows)}
+    document.tree["nodes"][0]["extensions"] = {"EXT_mesh_gpu_instancing": {"attributes": given}}
+    warning = "instances of a skinned mesh (EXT_mesh_gpu_instancing) are not supported"
+    assert warning in document.load(tmp_path).warnings
+
+
 def test_a_mirroring_node_keeps_the_outside(tmp_path):
     nodes = [{"mesh": 0}, {"mesh": 0, "scale": [-1, 1, 1]}]
     document = Document(nodes=nodes, scenes=[{"nodes": [0, 1]}])
@@ -561,6 +572,12 @@ def test_unread_content_is_named(tmp_path, name):
     change(document)
     mesh = document.load(tmp_path)
     assert warning in mesh.warnings and len(mesh.faces) == 2
+
+
+def test_names_that_look_like_extensions(tmp_path):
+    document = Document(nodes=[{"mesh": 0, "name": "LP_body"}]).paint()
+    document.attributes["_BATCHID"] = 0
+    assert not document.load(tmp_path).warnings
 
 
 @pytest.mark.parametrize(

@@ -87,8 +87,6 @@ def _renamed(draw: Draw, case: Case, name: str) -> Case:
     odd = [n for n in odd if n.isprintable()]
     names = [path.stem + choice(draw, *suffixes), choice(draw, *odd) + path.suffix]
     names.append("..." + path.suffix)
-    if path.suffix == ".sh3f":
-        names += ["...sh3f", "icons.sh3f", "catalogue.json.sh3f", ".sh3f", "a b.sh3f"]
     new = (path.parent / choice(draw, *names)).as_posix()
     if any(part == new or part.startswith(new + "/") for part in case.files):
         return case

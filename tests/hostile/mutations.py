@@ -30,12 +30,10 @@ NAMES = (
     "<script>alert(1)</script>", "' onerror='alert(1)", "%s%n", "file:///etc/passwd",
     "http://127.0.0.1:9/x", "data:image/png;base64,AAAA", "x" + chr(0x10FFFF),
 )  # fmt: skip
-_TOKENS = {
-    b"ply": (b"char", b"list uchar int", b"double", b"element face 3", b"format ascii 1.0",
-             b"property list int int x", b"property float x", b"end_header", b"comment"),
-    b"# .PCD": (b"ascii", b"binary", b"binary_compressed", b"normal_x", b"rgb", b"F", b"U", b"8",
-                b"FIELDS", b"COUNT", b"_", b"x"),
-}  # fmt: skip
+_PLY = (
+    b"char", b"list uchar int", b"double", b"element face 3", b"format ascii 1.0",
+    b"property list int int x", b"property float x", b"end_header", b"comment",
+)  # fmt: skip
 _WHOLE = (0, 1, 0x7F, 0xFF, 0x7FFF, 0xFFFF, 0x7FFFFFFF, 0x80000000, 0xFFFFFFFF, 0xFFFFFFC4)
 _FLOATS = (float("nan"), float("inf"), -float("inf"), 1e38, 1e-40, -0.0)
 _WORDS = dict.fromkeys(
@@ -139,7 +137,7 @@ def near_number(draw: Draw, data: bytes) -> bytes:
 
 def hostile_word(draw: Draw, data: bytes) -> bytes:
     """Replace a word by a hostile name, by a word of the format's own, or by an over-long one."""
-    own = next((words for head, words in _TOKENS.items() if data.startswith(head)), ())
+    own = _PLY if data.startswith(b"ply") else ()
     word = choice(draw, *map(encode, NAMES), *own * 3, b"\xff\xfe", b"9" * 5000)
     return _replaced(draw, data, rb"[^\s]+", lambda _: word)
 

@@ -190,17 +190,3 @@ def test_autocast_equals_prepend_and_drop():
     # As far from float32 as the plain form, and no further from it than the two roundings.
     assert (got - exact).square().mean().sqrt() < 1.2 * error
     assert (got - want).square().mean().sqrt() < 1.4 * error
-
-
-def test_states_do_what_they_say():
-    """One state per block, independent of the others; float32 and in the order of the blocks."""
-    blocks = make_blocks(3, 7, 11)
-    camera, image = torch.randn(2, 1, 7), torch.randn(2, 5, 11)
-    together = prefix_states(blocks, camera, image)
-    for block, state in zip(blocks, together):
-        (alone,) = prefix_states([block], camera, image)
-        assert state.conv.shape == (2, 3, 48) and state.scan.shape == (2, 48, 5)
-        assert state.scan.dtype == torch.float32
-        # Another size of matrix product sums in another order.
-        assert_rel_rms(state.conv, alone.conv, 1e-6, "conv")
-        assert_rel_rms(state.scan, alone.scan, 1e-6, "scan")

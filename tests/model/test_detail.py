@@ -14,7 +14,7 @@ from gamba_warp.cameras import Cameras, intrinsics, orbit
 from gamba_warp.conventions import over_background
 from gamba_warp.data.preprocess import resize_rgba
 from gamba_warp.formats.ply import load_ply
-from gamba_warp.gaussians import Gaussians
+from gamba_warp.gaussians import Gaussians, quat_multiply
 from gamba_warp.image_metrics import psnr
 from gamba_warp.images import save_image
 from gamba_warp.model import detail as subject
@@ -240,6 +240,23 @@ def test_a_cell_counts_as_much_as_its_alpha():
     ]
     assert len(depths[0]) == len(depths[1]) > 500
     assert (depths[1] - depths[0]).abs().max() < 0.02
+
+
+def test_children_of_turned_gaussians_keep_the_axis_along_the_view():
+    quarter = math.sqrt(0.5)
+    turns = torch.tensor([[1.0, 0, 0, 0], [quarter, quarter, 0, 0], [quarter, 0, quarter, 0]])
+    # Turned about x the axis y looks along the view, about y it is the axis x.
+    want = torch.tensor([[0, 0, 1], [0, 1, 0], [1, 0, 0]], dtype=torch.bool)
+    assert torch.equal(subject._along_the_view(3 * turns, turns), want)
+    some = torch.randn(50, 4, generator=torch.Generator().manual_seed(1))
+    axes = torch.cat([torch.zeros(3, 1), torch.eye(3)], 1).expand(50, 3, 4)
+    back = some * torch.tensor([1.0, -1, -1, -1])
+    turned = quat_multiply(quat_multiply(some[:, None].expand(50, 3, 4), axes), back[:, None])
+    want = turned[..., 3].abs().argmax(1)
+    assert torch.equal(subject._along_the_view(some, some).float().argmax(1), want)
+    model = fresh(predict_rotation=True)
+    found = reconstruct(model, board(48, 2), detail=2)
+    assert found.quats is not None and found.num > reconstruct(model, board(48, 2), detail=1).num
 
 
 def test_the_count_is_bounded(monkeypatch):

@@ -50,11 +50,6 @@ def test_what_is_faint_is_not_drawn_and_what_is_not_finite_stays():
         assert_close(gaussians.drawn(least).opacities, gaussians.opacities[kept], equal_nan=True)
 
 
-def test_detach_cuts_the_graph():
-    gaussians = batch().map(lambda value: value.requires_grad_())
-    assert gaussians.means.requires_grad and not gaussians.detach().means.requires_grad
-
-
 def test_quaternion_product_is_the_matrix_product():
     p, q = torch.randn(2, 4, dtype=torch.float64)
     got = rotations(quat_multiply(p, q))

@@ -6,7 +6,7 @@ from helpers import assert_default_dtype_changes_nothing, assert_rel_rms
 from helpers.model import FIELDS, inputs, micro
 from helpers.refusals import refused
 
-from gamba_warp.cameras import Cameras, orbit
+from gamba_warp.cameras import Cameras, intrinsics, orbit, reference_viewmat
 from gamba_warp.model.config import PRESETS, GambaConfig
 from gamba_warp.model.gamba import Gamba
 
@@ -200,3 +200,45 @@ def test_a_default_of_float64_changes_nothing(changes):
         return [*made, *model.state_dict().values(), *(p.grad for p in parameters)]
 
     assert_default_dtype_changes_nothing(run)
+
+
+@pytest.fixture(scope="module")
+def shallow():
+    torch.manual_seed(0)
+    config = GambaConfig(
+        image_size=32, patch_size=4, width=16, depth=2, state_size=4, encoder="none",
+        encoder_size=32,
+    )  # fmt: skip
+    return Gamba(config).eval()
+
+
+def dotted(*squares):
+    """White images with a grey pixel each, at row and column."""
+    made = torch.ones(len(squares), 32, 32, 3)
+    for image, (y, x) in zip(made, squares):
+        image[y, x] = 0.9
+    viewmats = reference_viewmat(1.9).repeat(len(squares), 1, 1)
+    K = intrinsics(32, 32).repeat(len(squares), 1, 1)
+    return made, Cameras(viewmats, K, 32, 32)
+
+
+@torch.no_grad()
+def test_background_tokens_are_dropped(shallow):
+    full = shallow(*dotted((5, 9)))
+    assert full.means.shape == (1, 4 * 64, 3)
+    for margin, patches in ((0, 1), (1, 9), (2, 4 * 5), (100, 64)):  # row 1, column 2 of 8 x 8
+        made = shallow(*dotted((5, 9)), background_margin=margin)
+        assert made.means.shape == (1, 4 * patches, 3)
+    assert torch.equal(made.means, full.means) and torch.equal(made.scales, full.scales)
+    kept = shallow.tokens.foreground(dotted((5, 9))[0], 1.0, 0)
+    first = 1 * 8 + 2, 64 + 2 * 8 + 1  # by rows, then by columns; then each backward
+    assert kept.tolist() == [first[0], first[1], 191 - first[0], 255 - (first[1] - 64)]
+
+
+@torch.no_grad()
+def test_a_token_is_kept_if_any_image_of_the_batch_needs_it(shallow):
+    both, cameras = dotted((5, 9), (30, 30))
+    assert shallow(both, cameras, background_margin=0).means.shape == (2, 8, 3)
+    assert shallow(torch.ones_like(both), cameras, background_margin=3).means.shape == (2, 0, 3)
+    with pytest.raises(ValueError, match="background_margin is -1"):
+        shallow(both, cameras, background_margin=-1)

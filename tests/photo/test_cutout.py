@@ -273,6 +273,18 @@ def test_the_cut_out_can_be_mended_and_given_again(tmp_path, network, busy):
     np.testing.assert_allclose(mended.source_rgb[:, :20], source, atol=0.51 / 255)
 
 
+def test_no_fringe_of_the_background_is_left():
+    alpha = disc_on_noise((80, 80))[1]
+    soft = np.clip(alpha * 1.0, 0, 1)
+    red, green = np.array([0.9, 0.1, 0.1]), np.array([0.0, 0.9, 0.2])
+    rgb = (soft[..., None] * red + (1 - soft[..., None]) * green).astype(np.float32)
+    clean = cutout._blended(rgb, soft)
+    boundary = (soft > 0.1) & (soft < 0.9)
+    assert boundary.sum() > 30 and np.abs(rgb[boundary] - red).max() > 0.5
+    assert np.abs(clean[boundary][:, :3] - red).max() < 0.12  # what blurs cannot tell apart
+    np.testing.assert_array_equal(clean[soft == 1][:, :3], rgb[soft == 1])
+
+
 @pytest.mark.parametrize(
     "box, fault",
     [
@@ -461,6 +473,28 @@ def test_with_a_few_transparent_pixels_the_object_may_be_all(tmp_path, spread):
     save_image(tmp_path / "a.png", rgba)
     found = cut_out(tmp_path / "a.png", CutoutOptions(fetch=False, notify=lambda line: None))
     assert found.method == "alpha" and (found.mask == rgba[..., 3]).all()
+
+
+@pytest.mark.parametrize("second", [0.0, 1.0, "elsewhere"])
+def test_a_small_object_stays_the_one_that_was_found(tmp_path, monkeypatch, second):
+    """If a method finds nothing, or another thing, among the object's own pixels."""
+    monkeypatch.setattr(cutout, "WORKING_SIZE", 128)
+    save_image(tmp_path / "noise.png", np.random.default_rng(0).random((160, 160, 3)))
+
+    def segmenter(rgb):
+        alpha = np.zeros(rgb.shape[:2], np.float32)
+        if len(rgb) == 128:
+            alpha[40:56, 32:64] = 1
+        elif second == "elsewhere":
+            alpha[:, :20] = 1
+        else:
+            alpha[:] = second
+        return alpha
+
+    monkeypatch.setattr(cutout, "SamSegmenter", lambda *_: segmenter)
+    found = cut_out(tmp_path / "noise.png", CutoutOptions(sam="sam.pth"))
+    rows, columns = (np.ptp(np.nonzero(found.rgba[..., 3] > 0.5)[axis]) + 1 for axis in (0, 1))
+    assert found.method == "sam" and (rows, columns) == (20, 40)  # 1.25 as many
 
 
 @pytest.mark.parametrize("way", ["plain", "alpha", "mask", "matte"])

@@ -203,11 +203,3 @@ def test_the_notebook_runs(workplace):
             exec(compile("".join(cell["source"]), cell["id"], "exec"), names)
         shown = [o for o in cell["outputs"] if o["output_type"] == "stream"]
         assert_alike(out.getvalue(), "".join("".join(o["text"]) for o in shown))
-
-
-def test_every_path_of_the_architecture_page_exists():
-    """Check every file and folder that the page names in code quotes."""
-    text = (ROOT / "docs" / "architecture.md").read_text()
-    paths = re.findall(r"`((?:kernels|gamba_warp|train|eval|tests|docs)/[\w./-]*)`", text)
-    assert len(paths) > 30
-    assert not [path for path in paths if not (ROOT / path).exists()]

@@ -11,7 +11,6 @@ import pytest
 import yaml
 from helpers.children import ran
 from lab import scanned
-from website.links import rewritten
 
 from gamba_warp.versions import __version__
 
@@ -70,13 +69,6 @@ def test_a_page_loads_nothing_from_elsewhere(site):
         reader.feed(page.read_text(encoding="utf-8"))
         outside = [name for name in reader.found if re.match(r"(https?:)?//", name)]
         assert not outside, f"{page}: {outside}"
-
-
-def test_links_keep_their_anchors_and_blocks_of_code_are_left():
-    text = "[a](../eval/README.md#b) [c](#d) [e](https://f.org/g.md)\n"
-    block = f"```text\n{text}```\n"
-    new = "[a](repository/eval.md#b) [c](#d) [e](https://f.org/g.md)\n"
-    assert rewritten(text + block, "docs/gpu.md", "gpu.md") == new + block
 
 
 def test_the_citation_is_that_of_the_paper():

@@ -156,13 +156,6 @@ def test_a_user_installs_no_tools_of_developers(target, tmp_path):
     assert "pip fetches" in said
 
 
-@pytest.mark.parametrize("target", ["test", "lint", "docs", "format", "hostile", "endurance"])
-def test_tests_and_checks_add_their_tools(target, tmp_path):
-    said = commands(tmp_path, target)
-    tools = said.index("--editable '.[test]'")
-    assert said.index("--editable '.[all]'") < tools < said.rindex(str(tmp_path / "none"))
-
-
 def test_a_locked_set_up_has_the_versions_of_constraints(tmp_path):
     assert "--constraint" not in commands(tmp_path, "test")
     locked = commands(tmp_path, "test", "LOCKED=1")

@@ -9,8 +9,8 @@ from pathlib import Path
 import pytest
 import tyro
 from helpers import micro
+from helpers.gobjaverse import write_object
 from helpers.micro import MODEL, lines
-from helpers.published.gobjaverse import write_object
 from helpers.refusals import refused, refused_command
 
 from gamba_warp import cli
@@ -131,14 +131,7 @@ def test_the_shipped_models_recipe():
     shipped = re.search(r"gamba train (.*?)```", card, re.DOTALL)[1].replace("\\\n", "")
     shipped = parse(*shlex.split(shipped))  # its losses are those of the recipe from the start
     assert config.loss == replace(shipped.loss, lpips_after=1500)
-    for name in (
-        "front_fraction",
-        "flip",
-        "color_jitter",
-        "procedural",
-        "background",
-        "views_per_object",
-    ):
+    for name in "front_fraction flip color_jitter procedural background views_per_object".split():
         assert getattr(config.views, name) == getattr(shipped.views, name), name
     assert "not measured" in RECIPES["rays"].about
 

@@ -502,26 +502,6 @@ def test_a_phone_and_a_small_frame_hold_all_buttons(viewer):
             assert all(b - a >= 28 for a, b in zip(row, row[1:]))
 
 
-def test_it_draws_less_while_it_moves_and_all_at_rest(viewer):
-    opened = viewer(colourful(600))
-    page, before = opened.page, canvas(opened)
-    drawn = page.evaluate("""() => new Promise((done) => {
-      const { renderer } = gambaViewer, draw = renderer.draw.bind(renderer);
-      Object.assign(gambaViewer, { adapt() {}, coarse: 3, some: 100 });
-      renderer.draw = (...all) => {
-        renderer.draw = draw;
-        draw(...all);
-        done([renderer.part[0], all[4], all[5], renderer.ordered]);
-      };
-      gambaViewer.act.turn(30, 0);
-      gambaViewer.changed += 1e6;  // it goes on moving, however slow this machine is
-    })""")
-    assert drawn == [(WIDE + 1) // 2, 0, 100, 100]  # the 100 that cover most, in their own order
-    page.evaluate("gambaViewer.goHome()")
-    np.testing.assert_array_equal(canvas(opened), before)
-    assert page.evaluate("gambaViewer.renderer.ordered") == 600 and not opened.messages
-
-
 def test_a_slow_machine_gets_coarser_images_and_a_fast_one_sharper(viewer):
     opened = viewer(colourful(50))
     found = opened.page.evaluate("""() => {

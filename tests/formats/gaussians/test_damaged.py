@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 import torch
 import trimesh
+from formats.gaussians.differences import check
 from helpers import refusals
 from helpers.gaussians import khr_glb, some
-from helpers.judges.splats import check
 from helpers.meshes import glb
 
 from gamba_warp.errors import UserError

@@ -3,8 +3,8 @@
 import gaussforge
 import numpy as np
 import pytest
+from formats.gaussians.differences import ALLOWED, check, differences, published
 from helpers.gaussians import covariances, some
-from helpers.judges.splats import ALLOWED, check, differences, published
 
 from gamba_warp.cli import run
 from gamba_warp.formats.gaussians.files import write_gaussians

@@ -6,8 +6,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from formats.gaussians.differences import check, differences
 from helpers.gaussians import khr_glb, some
-from helpers.judges.splats import check, differences
 from helpers.refusals import refused
 
 from gamba_warp.cameras import Cameras, intrinsics

@@ -99,14 +99,6 @@ def test_condition_recomputation_and_autocast():
     assert_rel_rms(rounded, want, 0.1, "bfloat16")  # 8 bits, through two blocks
 
 
-def test_attention_knows_no_order():
-    given = [micro(mixer="attention", image_tokens=kind) for kind in ("prefix", "mixed")]
-    one, other = (Gamba(config, "random") for config in given)
-    other.load_state_dict(one.state_dict())
-    batch = inputs(1)
-    assert torch.equal(one(*batch).means, other(*batch).means)
-
-
 def test_refused():
     refused("image_tokens mixed needs prepend", micro, image_tokens="mixed", prepend=False)
 

@@ -194,13 +194,6 @@ def test_bad_input_is_one_line_and_code_2(monkeypatch, tmp_path, capsys, argumen
     refused_command(capsys, "bench", words, reason.format(tmp_path))
 
 
-@pytest.mark.skipif(torch.cuda.is_available(), reason="there is a GPU")
-def test_cuda_without_a_gpu(tmp_path, capsys):
-    words = ["scan", "--device", "cuda", "--out", tmp_path / "x"]
-    refused_command(capsys, "bench", words, "gamba: --device cuda: no CUDA device is available")
-    assert not (tmp_path / "x").exists()
-
-
 def test_failures_give_code_1(monkeypatch, tmp_path, capsys):
     stub(monkeypatch, case(variant("bad", error=1.0)))
     assert machine.bench_command(("scan",), quick=True, out=tmp_path) == 1

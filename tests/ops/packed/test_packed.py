@@ -96,18 +96,6 @@ def test_scan_on_cuda_of_long_sequences(from_ptx):
             assert_as_alone(scan, scan_inputs(lengths, 5, 3), lengths, 1e-5)
 
 
-def test_scan_on_cuda_cuts_few_sequences(from_ptx):
-    """As many segments as so many sequences of the mean length have; one alone is as unpacked."""
-    from_ptx()
-    chosen = []
-    with patch.object(cuda, "choose", lambda *shape: chosen.append(shape) or cuda.Tuning(2)):
-        scan(**scan_inputs([100, 0, 131], 5, 3), cu_seqlens=borders([100, 0, 131]))
-    assert {shape[:5] for shape in chosen} == {(3, 77, 5, 3, 1)}
-    for lengths, segments in (([2048], 24), ([410] * 5, 3), ([265] * 64, 1)):
-        got = cuda.choose(len(lengths), -(-sum(lengths) // len(lengths)), 1024, 16, 1, 132)
-        assert got.segments == segments
-
-
 def test_borders_that_nobody_looks_at_are_bounded(from_ptx):
     """On CUDA and under torch.compile: those that fall end an empty sequence, none overlap."""
     inputs = scan_inputs([70, 0, 60, 0], 5, 3)

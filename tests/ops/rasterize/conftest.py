@@ -1,7 +1,7 @@
 """Fixtures of the rasterizer's tests: those of others, and its CUDA path, executed from PTX."""
 
 import pytest
-from helpers.raster_accuracy import cuts
+from ops.rasterize.accuracy import cuts
 
 from gamba_warp.kernels.rasterize.cuda import capacity
 from gamba_warp.kernels.rasterize.cuda import composite as composite_cuda

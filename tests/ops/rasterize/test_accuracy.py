@@ -8,7 +8,7 @@ and each must lie within rounding of a cut.
 import pytest
 import torch
 from helpers.raster import NAMES, make, mapped
-from helpers.raster_accuracy import BAND, assert_gradients, both
+from ops.rasterize.accuracy import BAND, assert_gradients, both
 
 from gamba_warp.kernels.rasterize import rasterization, reference
 from gamba_warp.kernels.rasterize.constants import ALPHA_MIN

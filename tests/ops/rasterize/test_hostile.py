@@ -5,7 +5,7 @@ import math
 import pytest
 import torch
 from helpers.raster import IMAGE, NAMES, leaves, make, mapped
-from helpers.raster_accuracy import assert_gradients, both
+from ops.rasterize.accuracy import assert_gradients, both
 
 from gamba_warp.kernels.rasterize import rasterization
 

@@ -1,14 +1,16 @@
-"""Promises of the rasterizer beyond the oracle: known answers, culling, repeatability, errors."""
+"""Promises of the rasterizer beyond the oracle: known answers, culling, limits, errors."""
 
 import math
 
 import pytest
 import torch
-from helpers import assert_rel_rms
+from helpers import assert_rel_rms, rel_rms
 from helpers.raster import NAMES, leaves, make, mapped
 
+from gamba_warp.kernels.cases.raster import orbit_cameras, raster_case, shell
 from gamba_warp.kernels.rasterize import autograd, rasterization
 from gamba_warp.kernels.rasterize.cpu import bin as bin_cpu
+from gamba_warp.kernels.rasterize.reference import rasterization_reference
 
 
 def one(mean=(0.0, 0.0, 2.0), scale=0.1, opacity=0.8, size=(33, 31), focal=40.0):
@@ -200,3 +202,34 @@ def test_too_many_pairs(monkeypatch, many):
     monkeypatch.setattr(autograd, "MAX_PAIRS", 5000)
     with pytest.raises(ValueError, match="pairs of tiles and Gaussians"):
         rasterization(**make(num=400, size=1.0))
+
+
+def scene(**options):
+    viewmats, Ks = orbit_cameras(2, 75)
+    viewmats[:, 0, 3] += 0.03
+    return raster_case(shell(400, 3), (viewmats, Ks), 75, torch.device("cpu"), **options)
+
+
+def results(of):
+    renders, alphas, meta = of.forward()
+    return [renders, alphas, *of.backward()], meta
+
+
+@pytest.mark.parametrize("t_min", [0.3, 1e-2, 1e-30])
+def test_the_limit_of_transmittance(t_min):
+    """Against the oracle with the same limit; the default's image is another one."""
+    made = scene(t_min=t_min)
+    got, _ = results(made)
+    x = {k: v.double() for k, v in made.inputs.items() if k != "pixels"}
+    want, _, alphas = rasterization_reference(**x, width=75, height=75, t_min=t_min)
+    # a pixel at a threshold may fall on its other side
+    assert ((got[0] - want).abs() < 1e-4).float().mean() > 0.999
+    assert ((got[1] - alphas).abs() < 1e-4).float().mean() > 0.999
+    assert rel_rms(got[0], results(scene())[0][0]) > 1e-6
+    assert all(g.isfinite().all() for g in got)
+
+
+@pytest.mark.parametrize("t_min", [0.0, 1.0, -1e-4, float("nan")])
+def test_limits_that_are_refused(t_min):
+    with pytest.raises(ValueError, match="t_min must be in"):
+        scene(t_min=t_min).forward()

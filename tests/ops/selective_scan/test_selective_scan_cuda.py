@@ -8,7 +8,7 @@ from helpers.scan import STATE, compare, leaves, make, oracle
 
 from gamba_warp.kernels.selective_scan import selective_scan
 from gamba_warp.kernels.selective_scan.cuda import launch as cuda
-from gamba_warp.kernels.selective_scan.cuda.launch import Tuning, choose
+from gamba_warp.kernels.selective_scan.cuda.launch import Tuning
 from gamba_warp.kernels.selective_scan.problem import Inputs, Options, Scan
 
 NAMES = Inputs._fields
@@ -160,21 +160,6 @@ def test_empty(batch, length):
         assert not got[name].any(), name
     alone = run({k: inputs[k] for k in STATE}, "mamba", None, v_last)
     assert torch.equal(alone["last"], inputs["initial_state"])
-
-
-def test_choice_follows_the_shape():
-    def segments(batch, length):
-        tuning = choose(batch, length, 1024, 16, 1, multiprocessors=132)
-        return tuning.segments, tuning.back_segments
-
-    assert segments(16, 16961) == (1, 1)
-    few, back_few = segments(1, 16961)
-    assert 8 <= few <= 64 and 8 <= back_few <= 64  # 16 blocks of channels, 132 multiprocessors
-    assert segments(1, 64) == (1, 1)
-    assert segments(1, 128)[0] <= 2
-    assert choose(0, 5, 8, 4, 1, 132) == Tuning()
-    counts = [segments(batch, 16961)[0] for batch in (1, 2, 4, 8, 16, 32)]
-    assert counts == sorted(counts, reverse=True)
 
 
 def gpu_gradients(inputs, v_out, v_last):

@@ -183,6 +183,21 @@ def test_two_runs_that_differ_are_a_failure(monkeypatch):
     assert outcome.faults == ["two runs differ in out"]
 
 
+def test_interrupted_keeps_what_was_found(tmp_path, monkeypatch, capsys):
+    right, count = scan.selective_scan, iter(range(100))
+
+    def interrupted(*arguments, **options):
+        if next(count) == 6:
+            raise KeyboardInterrupt
+        return right(*arguments, **options)
+
+    monkeypatch.setattr(scan, "selective_scan", interrupted)
+    assert exit_code("scan", "--cases", 24, "--out", tmp_path) == 130
+    document = json.loads((tmp_path / "stress.json").read_text())
+    assert document["interrupted"] and 0 < sum(row["cases"] for row in document["rows"]) < 24
+    assert "interrupted" in capsys.readouterr().out
+
+
 def test_constant_input_matrix_sums_its_gradient_in_float32():
     """Found by this command: tokens and repeated groups were summed in bfloat16 and float16."""
     torch.manual_seed(0)

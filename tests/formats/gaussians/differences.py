@@ -6,9 +6,8 @@
 import gaussforge
 import numpy as np
 import torch
-from plyfile import PlyData
-
 from helpers.gaussians import covariances, rotations
+from plyfile import PlyData
 
 
 def differences(want, got):

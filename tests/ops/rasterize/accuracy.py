@@ -7,11 +7,11 @@ compare.
 
 import pytest
 import torch
+from helpers import assert_rel_rms
+from helpers.raster import GRADIENT, IMAGE, NAMES, rendered
 
 from gamba_warp.kernels.rasterize import reference
 from gamba_warp.kernels.rasterize.constants import T_MIN
-from helpers import assert_rel_rms
-from helpers.raster import GRADIENT, IMAGE, NAMES, rendered
 
 ROW = 1e-3  # of one Gaussian's gradient: a sum over few pixels, some of which cancel
 ROWS = 0.999  # the fraction of Gaussians that must keep to it
