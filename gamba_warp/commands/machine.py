@@ -81,7 +81,7 @@ def bench_command(
 
     from ..kernels.bench.measure import Settings, measure
     from ..kernels.bench.peers import versions
-    from ..kernels.bench.report import busy_line, charts, markdown
+    from ..kernels.bench.report import busy_line, charts, failures, markdown
 
     if quick and full:
         raise UserError("--quick and --full: choose one")
@@ -107,9 +107,8 @@ def bench_command(
     write_text(folder / "bench.md", markdown(document))
     for op, chart in charts(document).items():
         write_text(folder / f"bench-{op}.svg", chart)
-    failed = [r for r in document["records"] if r["status"].startswith(("failed", "check"))]
-    for r in failed:
-        print(f"{r['op']}: {r['case']}: {r['variant']}, {r['direction']}: {r['status']}")
+    failed = failures(document)
+    print(*(f"{line}\n" for line in failed), sep="", end="")
     measured = sum(r["status"] == "ok" for r in document["records"])
     print(f"{measured} measured; wrote {folder / 'bench.json'}, bench.md and charts")
     if line := busy_line(document):
