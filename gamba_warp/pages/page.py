@@ -39,8 +39,6 @@ class Section:
         gaussians: one object ``[N]``, for the 3D viewer.
         mesh: its surface, with ``vertices``, ``faces`` and ``colors``, for the viewer; or None.
         strip: one wide image ``[H, W, 3]``, floats in [0, 1].
-        views: images ``[V, H, W, 3]``, floats in [0, 1], by label; each label is a row of views,
-            such as "Predicted" above "Truth".
         links: thumbnails ``[H, W, 3]`` uint8 by name, which link to NAME.html in the page's folder.
         files: names of files in the page's folder, for download.
         table: rows of cells; text is left-aligned, numbers right-aligned. Below a header, texts of
@@ -57,7 +55,6 @@ class Section:
     gaussians: Gaussians | None = None
     mesh: Any = None
     strip: np.ndarray | None = None
-    views: Mapping[str, np.ndarray] = field(default_factory=dict)
     links: Mapping[str, np.ndarray] = field(default_factory=dict)
     files: Sequence[str] = ()
     table: Sequence[Sequence[str | int | float]] = ()

@@ -66,7 +66,6 @@ def full(title="A chair", **changes):
         image=images(9, 9, 4),
         turntable=frames(),
         gaussians=some(11),
-        views={"Predicted": images(3, 8, 8, 3), "Truth": images(2, 8, 8, 3)},
         header=("", "PSNR"),
         table=[("input", 24.3456), ("novel", 19), ("note", "n/a")],
     )
@@ -125,19 +124,19 @@ def test_images_come_back_from_the_page(tmp_path):
     (tmp_path / "turn.webp").write_bytes(images[1][1])
     with Image.open(tmp_path / "turn.webp") as image:
         assert image.n_frames == 5 and image.size == (24, 24)
-    assert features.check("webp") and len(images) == 2 + 5
+    assert features.check("webp") and len(images) == 2
 
 
 def test_text_is_escaped(tmp_path):
     nasty = '</script><b onload="x">&'
     section = Section(nasty, text=nasty, header=(nasty, nasty))
     section.table, section.details = [(nasty, 1), (1.5, nasty)], {nasty: nasty}
-    section.views, section.files = {nasty: images(1, 4, 4, 3)}, [nasty]
+    section.files = [nasty]
     section.links = {nasty: frames(1)[0]}
     write_page(tmp_path / "a.html", nasty, [section], nasty)
     page = Page(tmp_path / "a.html")
     assert not page.all("b") and "</script><b" not in page.source
-    assert page.text.count(nasty) == 14
+    assert page.text.count(nasty) == 13
 
 
 def test_tables_show_numbers_to_four_digits():
