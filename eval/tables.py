@@ -53,7 +53,7 @@ def figures(
     for row in rows:
         cells = []
         for key, column in columns.items():
-            found = row.figures[key]
+            found = row.figures.get(key)
             shown = found and cell(found[of], found.get(ends), column.digits, row.signed)
             cells.append(shown or "-")
         lines.append([*row.names, *cells])
