@@ -33,7 +33,6 @@ BENCH = {
 STRESS = {
     "scan": ("gamba_warp.kernels.cases.scan", "gamba_warp.kernels.cases.conv"),
     "raster": ("gamba_warp.kernels.cases.raster",),
-    "model": ("gamba_warp.measure.stress",),
 }
 
 
@@ -137,13 +136,13 @@ def stress_command(
     threads: Threads | None = None,
     out: Path = Path("out/stress"),
 ) -> int:
-    """Compare kernels and model with float64 on random and hostile cases.
+    """Compare kernels with float64 on random and hostile cases.
 
     Checks forward results and all gradients. A failing case is made smaller. Writes stress.json and
     stress.md. Ctrl-C keeps the results so far.
 
     Args:
-        what: scan (with the convolution), raster, model, or all (of these).
+        what: scan (with the convolution), raster, or all (of these).
         seed: The same seed gives the same cases in the same order.
         minutes: Time limit; by default 1, or none with --cases.
         cases: Number of cases of each operator; by default as many as fit in --minutes.

@@ -62,7 +62,7 @@ def test_version(flag, capsys):
         ("eval-geometry a b --protocol splatter-image".split(), "is for views (gamba eval-views)"),
         (["bench", "a"], "unknown case 'a'; there are scan, conv, raster, model, step and all"),
         ("bench scan --quick --full".split(), "choose one"),
-        (["stress", "sort"], "unknown case 'sort'; there are scan, raster, model and all"),
+        (["stress", "sort"], "unknown case 'sort'; there are scan, raster and all"),
     ],
 )
 def test_wrong_words_of_commands_are_told_in_one_line(arguments, reason, capsys):
