@@ -99,7 +99,7 @@ def markdown_table(table: dict[str, Any]) -> str:
     """Return the text of ``table.md``."""
     rows, plan = table["rows"], table["plan"]
     shown = [key for key in METRICS if any(key in row["figures"] for row in rows)]
-    columns = {key: tables.Column(METRICS[key].head, METRICS[key].digits) for key in shown}
+    columns = tables.columns_of({key: METRICS[key] for key in shown})
     heads = [column.title for column in columns.values()]
     main, changes, spreads, papers = [], [], [["", *heads]], [["", *heads]]
     for row in rows:
