@@ -274,8 +274,7 @@ NONSENSE = {
     },
     "export FILE": {
         "voxels": "7 1000000", "views": "0 1000000", "pixels": "0 1000000", "faces": "-1",
-        "close-holes": "-1", "smooth": "-1 100000", "min-component": "nan -1 1", "size": "8 100000",
-        "min-opacity": "nan -1 2", "frames": "1 1000000000",
+        "size": "8 100000", "min-opacity": "nan -1 2", "frames": "1 1000000000",
         "elevation": "91 nan", "fov": "0 180", "distance": "nan 0",
     },
     "reconstruct IMAGE": {
