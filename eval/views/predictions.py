@@ -7,6 +7,7 @@ from typing import TypeAlias
 
 import torch
 
+from gamba_warp.conventions import Detail
 from gamba_warp.data.dataset import ViewDataset
 from gamba_warp.devices import network_precision, pick_precision
 from gamba_warp.errors import UserError
@@ -59,7 +60,8 @@ class ModelPredictions:
     def __init__(self, options: ViewsOptions, device: str, size: int | None = None) -> None:
         path = options.checkpoint
         self.model, self.device = load_model(path, device, options.encoder_weights), device
-        self.margin, self.detail, self.size = options.background_margin, options.detail, size
+        self.margin, self.size = options.background_margin, size
+        self.detail: Detail | None = options.detail
         config = self.model.config
         checked_detail(self.detail, config, 0)
         self.precision = pick_precision(options.precision, torch.device(device), config.width)
