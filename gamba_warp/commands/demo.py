@@ -117,7 +117,9 @@ def write_demo(out: Path, model: Path, text: str) -> None:
 
     tables = {"views": out / "views" / "table.md", "shapes": out / "geometry" / "table.md"}
     figures = {
-        f"Figures of the {of}": p.read_text("utf-8") for of, p in tables.items() if p.exists()
+        f"Figures of the {name}": table.read_text(encoding="utf-8")
+        for name, table in tables.items()
+        if table.exists()
     }
     objects = Section(
         "Objects that the model has never seen",
