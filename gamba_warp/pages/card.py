@@ -41,12 +41,6 @@ class Figure(msgspec.Struct, frozen=True, omit_defaults=True):
     mean: float
     interval: tuple[float, float] | None = None
 
-    def text(self, digits: int) -> str:
-        """Format the mean, and in brackets the interval, with the given decimals."""
-        low_high = self.interval or ()
-        between = ", ".join(f"{value:.{digits}f}" for value in low_high)
-        return f"{self.mean:.{digits}f}" + (f" [{between}]" if between else "")
-
 
 class _Row(msgspec.Struct, frozen=True, omit_defaults=True):
     """Figures of a model or of a baseline: a field for each of ``METRICS``, None if not measured.
