@@ -14,7 +14,7 @@ EDIT := PYTHONWARNINGS='ignore:Editable installation' \
 WHEEL := build/wheel-check
 
 .PHONY: setup demo test ptx debug hostile endurance bench docs lint format figures \
-        scanned constraints clean
+        gpu scanned constraints clean
 
 setup: $(STAMP)
 
@@ -135,6 +135,12 @@ constraints: $(TOOLS)
 	   $(BIN)/python -m pip freeze --exclude-editable | sed -n 's/^\([^ @]*==[^+]*\).*/\1/p'; } \
 		> constraints.txt.new
 	@mv constraints.txt.new constraints.txt
+
+# On a machine with a GPU and torch, numpy, warp-lang and pytest; nothing is installed. Only files with
+# tests of a GPU are collected, because others import more packages.
+gpu:
+	$(PYTHON) -m pytest -m gpu $$(grep -rl '@pytest.mark.gpu' tests/gpu tests/ops tests/ptx); \
+		tests=$$?; $(PYTHON) -m gamba_warp.measure && exit $$tests
 
 clean:
 	rm -rf $(VENV) out build dist site *.egg-info

@@ -9,7 +9,8 @@ import numpy as np
 
 LEVEL = 0.95  # fraction of the resampled means within an interval
 RESAMPLES = 10_000
-BOOTSTRAP = {"level": LEVEL, "resamples": RESAMPLES, "seed": 0, "method": "percentile"}
+SEED = 0
+BOOTSTRAP = {"level": LEVEL, "resamples": RESAMPLES, "seed": SEED, "method": "percentile"}
 _BATCH = 1_000_000  # numbers drawn at once; bounds the memory
 
 Statistic = Callable[[np.ndarray], np.ndarray]  # ``[.., n]`` objects to ``[..]``
@@ -29,50 +30,25 @@ def median_of(records: list[dict[str, Any]]) -> dict[str, Any]:
     return _over_objects(records, lambda values: float(np.median(values)))
 
 
-def intervals_of(
-    records: list[dict[str, Any]],
-    level: float = LEVEL,
-    resamples: int = RESAMPLES,
-    seed: int = 0,
-    statistic: Statistic = lambda values: values.mean(-1),
-) -> dict[str, Any]:
+def intervals_of(records: list[dict[str, Any]]) -> dict[str, Any]:
     """Compute percentile bootstrap intervals of the means of ``mean_of``.
 
-    Each resample draws as many objects as there are, with replacement (Efron 1979). The interval
-    covers only the choice of objects; with a handful of objects it is too narrow.
-
-    Args:
-        records: records with the same keys, one for each object.
-        level: fraction of the resampled means within the interval.
-        resamples: number of draws.
-        seed: of the draws, which are the same for every number.
-        statistic: of the objects drawn; by default the mean.
-
     Returns:
-        The keys of ``mean_of``, each ``[low, high]``; None with fewer than 2 objects.
+        The keys of ``mean_of``, each as from ``bootstrap``.
     """
-
-    def interval(values: list[float]) -> list[float] | None:
-        return bootstrap(np.asarray(values, np.float64), statistic, level, resamples, seed)
-
-    return _over_objects(records, interval)
+    return _over_objects(records, lambda values: bootstrap(np.array(values, np.float64), mean))
 
 
-def bootstrap(
-    values: np.ndarray,
-    statistic: Statistic,
-    level: float = LEVEL,
-    resamples: int = RESAMPLES,
-    seed: int = 0,
-) -> list[float] | None:
-    """Compute the percentile interval of one statistic; see ``intervals_of``.
+def bootstrap(values: np.ndarray, statistic: Statistic) -> list[float] | None:
+    """Compute the percentile interval of a statistic.
+
+    Each resample draws as many objects as there are, with replacement (Efron 1979); the draws
+    depend on the number of objects alone. The interval covers only the choice of objects; with a
+    handful of objects it is too narrow.
 
     Args:
         values: ``[.., n]`` float64, of n objects; all values of an object are drawn together.
         statistic: maps ``[.., draws, n]`` to ``[draws]``.
-        level: fraction of the resampled statistics within the interval.
-        resamples: number of draws.
-        seed: of the draws.
 
     Returns:
         ``[low, high]``; None with fewer than 2 objects.
@@ -80,19 +56,24 @@ def bootstrap(
     count = values.shape[-1]
     if count < 2:
         return None
-    random = np.random.default_rng(seed)
+    random = np.random.default_rng(SEED)
     batch = max(1, _BATCH // count)
-    ends = [(1 - level) / 2, (1 + level) / 2]
     with np.errstate(all="ignore"):  # a sum may overflow
         found = [
-            statistic(values[..., random.integers(0, count, (min(batch, resamples - at), count))])
-            for at in range(0, resamples, batch)
+            statistic(values[..., random.integers(0, count, (min(batch, RESAMPLES - at), count))])
+            for at in range(0, RESAMPLES, batch)
         ]
-        return [float(value) for value in np.quantile(np.concatenate(found), ends)]
+        ends = np.quantile(np.concatenate(found), [(1 - LEVEL) / 2, (1 + LEVEL) / 2])
+    return ends.tolist()
+
+
+def mean(values: np.ndarray) -> np.ndarray:
+    """Return the mean of ``[.., n]`` objects, as a statistic of ``bootstrap``."""
+    return values.mean(-1)
 
 
 def median(values: np.ndarray) -> np.ndarray:
-    """Return the median of ``[.., n]`` objects, as a statistic of ``intervals_of``."""
+    """Return the median of ``[.., n]`` objects, as a statistic of ``bootstrap``."""
     return np.median(values, -1)
 
 
@@ -109,7 +90,7 @@ def summary_of(values: Sequence[float | None]) -> dict[str, Any]:
     known = np.array([value for value in values if value is not None], np.float64)
     return {
         "mean": float(known.mean()) if len(known) else None,
-        "interval": bootstrap(known, lambda drawn: drawn.mean(-1)),
+        "interval": bootstrap(known, mean),
         "median": float(median(known)) if len(known) else None,
         "median_interval": bootstrap(known, median),
     }

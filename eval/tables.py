@@ -5,7 +5,8 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, NamedTuple
 
-from gamba_warp.kernels.runtime.tables import cell as cell
+from gamba_warp.image_metrics import Metric
+from gamba_warp.kernels.runtime.tables import cell
 from gamba_warp.kernels.runtime.tables import markdown as table
 
 Lines = list[list[str]]  # cells by row, the head first
@@ -21,6 +22,11 @@ class Column(NamedTuple):
 
     title: str
     digits: int
+
+
+def columns_of(metrics: Mapping[str, Metric]) -> dict[str, Column]:
+    """Return the columns of image metrics, by their keys."""
+    return {key: Column(metric.head, metric.digits) for key, metric in metrics.items()}
 
 
 class Row(NamedTuple):
@@ -53,7 +59,7 @@ def figures(
     for row in rows:
         cells = []
         for key, column in columns.items():
-            found = row.figures[key]
+            found = row.figures.get(key)
             shown = found and cell(found[of], found.get(ends), column.digits, row.signed)
             cells.append(shown or "-")
         lines.append([*row.names, *cells])

@@ -8,7 +8,7 @@ import numpy as np
 
 from gamba_warp.formats.parts import merged
 
-from .shape import Mesh, directed_edges
+from .shape import Mesh, directed_edges, edges_of
 
 FLAGS = {
     "open": "an edge belongs to an odd number of faces",
@@ -62,13 +62,9 @@ def clean_mesh(mesh: Mesh, intersections: bool = False) -> CleanMesh:
 
 
 def _edge_flags(mesh: Mesh) -> set[str]:
-    edges = directed_edges(mesh.faces)
-    forward = edges[:, 0] < edges[:, 1]
-    order = np.sort(edges, axis=1)
-    _, index, counts = np.unique(
-        order[:, 0] * len(mesh.vertices) + order[:, 1], return_inverse=True, return_counts=True
-    )
-    balance = np.bincount(index.reshape(-1), np.where(forward, 1.0, -1.0), len(counts))
+    start, end = directed_edges(mesh.faces).T
+    _, index, counts = edges_of(mesh.faces)
+    balance = np.bincount(index, np.where(start < end, 1.0, -1.0), len(counts))
     there = {
         "open": (counts % 2 == 1).any(),
         "nonmanifold": (counts > 2).any(),

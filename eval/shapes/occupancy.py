@@ -11,7 +11,7 @@ import numpy as np
 from gamba_warp.formats.parts import merged
 
 from .options import OccupancyRule
-from .shape import Mesh, directed_edges
+from .shape import Mesh, edges_of
 
 VOTERS = 26  # rays per point
 RAYS = 1 << 12  # of one call, while the points are fewer
@@ -244,10 +244,7 @@ def open_parts(mesh: Mesh) -> list[Mesh]:
 
     vertices, index = merged(mesh.vertices)
     faces = index[mesh.faces]
-    edges = np.sort(directed_edges(faces), axis=1)
-    edge, count = np.unique(
-        edges[:, 0] * len(vertices) + edges[:, 1], return_inverse=True, return_counts=True
-    )[1:]
+    edges, edge, count = edges_of(faces)
     face, size = np.repeat(np.arange(len(faces)), 3), len(faces) + len(count)
     links = coo_array((np.ones(len(face), bool), (face, len(faces) + edge)), shape=(size, size))
     label = connected_components(links, directed=False)[1][: len(faces)]

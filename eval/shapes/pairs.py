@@ -124,17 +124,12 @@ def evaluate_shapes(options: ShapesOptions, protocol: GeometryProtocol) -> dict[
     Raises:
         UserError: something cannot be opened or written.
     """
-    if (protocol.frame == "reference") != (options.data is not None):
-        raise UserError("--frame reference and --data: give both or neither")
     listed = gso.names_of(options.objects) if protocol.name == "gso" else ()
     if options.objects is not None and not listed:
         raise UserError("--objects: needs --protocol gso")
     if options.limit is not None and listed:
         raise UserError("--limit: --protocol gso has its own objects; select others with --objects")
-    assert options.pred is not None and options.gt is not None  # checked by the command
-    dataset, known = open_objects(options.data)
-    pairs, failures = find_pairs(options.pred, options.gt, listed, known)
-    pairs, failures = limited(pairs, failures, options.limit)
+    dataset, pairs, failures = open_pairs(options, protocol, listed)
     folder = output_folder(options.out) if options.out is not None else None
     cache = RecordCache(folder, protocol, options.data)
     with stdout_to_stderr():
@@ -211,17 +206,36 @@ class RecordCache:
             self._file.unlink(missing_ok=True)
 
 
-def limited(
-    pairs: list[Pair], failures: list[dict[str, str]], limit: int | None
-) -> tuple[list[Pair], list[dict[str, str]]]:
-    """Keep ``limit`` objects of ``find_pairs``, evenly spaced by name; None keeps all."""
-    if limit is None:
-        return pairs, failures
-    from gamba_warp.data.dataset import evenly
+def open_pairs(
+    options: ShapesOptions, protocol: GeometryProtocol, expected: Iterable[str] = ()
+) -> tuple[ViewDataset | None, list[Pair], list[dict[str, str]]]:
+    """Open the dataset and pair the files that the options name.
 
-    names = {pair.name for pair in pairs} | {each["name"] for each in failures}
-    kept = {*evenly(sorted(names), limit)}
-    return [p for p in pairs if p.name in kept], [f for f in failures if f["name"] in kept]
+    Args:
+        options: with the files, the dataset and the number of objects.
+        protocol: of the comparison.
+        expected: names that must have a prediction.
+
+    Returns:
+        The dataset; and the pairs and failures of ``find_pairs``, of at most ``limit`` objects.
+
+    Raises:
+        UserError: as for ``open_objects`` and ``find_pairs``, or only one of frame "reference" and
+            dataset is given.
+    """
+    if (protocol.frame == "reference") != (options.data is not None):
+        raise UserError("--frame reference and --data: give both or neither")
+    assert options.pred is not None and options.gt is not None  # checked by the command
+    dataset, known = open_objects(options.data)
+    pairs, failures = find_pairs(options.pred, options.gt, expected, known)
+    if options.limit is not None:
+        from gamba_warp.data.dataset import evenly
+
+        names = {pair.name for pair in pairs} | {each["name"] for each in failures}
+        kept = {*evenly(sorted(names), options.limit)}
+        pairs = [pair for pair in pairs if pair.name in kept]
+        failures = [each for each in failures if each["name"] in kept]
+    return dataset, pairs, failures
 
 
 def find_pairs(

@@ -18,7 +18,7 @@ from ..averages import mean_of
 from ..report import OK, check_finite, finite_or_none, stdout_to_stderr
 from ..tables import Lines, markdown
 from .options import ShapesOptions
-from .pairs import Pair, evaluate_pairs, find_pairs, limited, open_objects
+from .pairs import Pair, evaluate_pairs, open_pairs
 from .protocol import PRESETS, GeometryProtocol
 from .shape import Similarity
 
@@ -96,13 +96,8 @@ def evaluate_variants(
     Raises:
         UserError: something cannot be opened or written, or no object could be evaluated.
     """
-    if (protocol.frame == "reference") != (options.data is not None):
-        raise UserError("--frame reference and --data: give both or neither")
-    assert options.pred is not None and options.gt is not None
-    dataset, known = open_objects(options.data)
+    dataset, pairs, failures = open_pairs(options, protocol)
     folder = None if options.out is None else output_folder(options.out)
-    pairs, failures = find_pairs(options.pred, options.gt, known=known)
-    pairs, failures = limited(pairs, failures, options.limit)
     protocols = variants(protocol)
     vary = partial(vary_pair, protocols=protocols)
     with stdout_to_stderr():
@@ -185,24 +180,20 @@ def _row_figures(metrics: dict[str, Any], protocol: GeometryProtocol) -> dict[st
 
 def _page(rows: dict[str, dict[str, Any]], count: int) -> str:
     """Return the text of ``sensitivity.md``."""
-    base = rows[CHOSEN]["mean"]
     lines: Lines = [
         ["", "objects", "Chamfer", "of the chosen", "F-score", "at", "normals", "Volume IoU"]
     ]
+    base = rows[CHOSEN]["mean"].get("chamfer")
     for label, row in rows.items():
-        mean = row["mean"]
-        values = [mean[key] if mean else None for key in ("chamfer", "fscore")]
-        fraction = (
-            values[0] / base["chamfer"] if values[0] is not None and base["chamfer"] else None
+        chamfer, fscore, normals, iou = (
+            row["mean"].get(key) for key in ("chamfer", "fscore", "normal_consistency", "iou")
         )
-        shown = [None if v is None else f"{v:.4f}" for v in values]
-        more = [mean.get(key) if mean else None for key in ("normal_consistency", "iou")]
+        ratio = chamfer / base if chamfer is not None and base else None
+        at = f"{min(row['thresholds']):g} of {row['unit']:g}"
         lines.append(
             [
-                *(label, str(row["objects"]), shown[0] or "-"),
-                "-" if fraction is None else f"{fraction:.2f}",
-                *(shown[1] or "-", f"{min(row['thresholds']):g} of {row['unit']:g}"),
-                *("-" if v is None else f"{v:.3f}" for v in more),
+                *(label, str(row["objects"]), _number(chamfer, 4), _number(ratio, 2)),
+                *(_number(fscore, 4), at, _number(normals, 3), _number(iou, 3)),
             ]
         )
     note = (
@@ -211,3 +202,7 @@ def _page(rows: dict[str, dict[str, Any]], count: int) -> str:
         "number is the ground truth's longest side."
     )
     return f"{markdown(lines)}\n\n{note}\n"
+
+
+def _number(value: float | None, digits: int) -> str:
+    return "-" if value is None else f"{value:.{digits}f}"

@@ -89,11 +89,9 @@ class Mesh:
         The parity of crossings then separates inside and outside, for any orientation of the faces.
         For a mesh of ``flags.clean_mesh`` it means the absence of the flag "open".
         """
-        faces = merged(self.vertices)[1][self.faces]
-        edges = np.sort(directed_edges(faces), axis=1)
-        edges = edges[edges[:, 0] != edges[:, 1]]  # without degenerate faces' edges
-        counts = np.unique(edges[:, 0] * len(self.vertices) + edges[:, 1], return_counts=True)[1]
-        return bool((counts % 2 == 0).all())
+        edges, edge, counts = edges_of(merged(self.vertices)[1][self.faces])
+        real = edges[:, 0] != edges[:, 1]  # without degenerate faces' edges
+        return bool((counts[edge[real]] % 2 == 0).all())
 
 
 Shape: TypeAlias = "Mesh | Points | Gaussians"
@@ -102,6 +100,19 @@ Shape: TypeAlias = "Mesh | Points | Gaussians"
 def directed_edges(faces: np.ndarray) -> np.ndarray:
     """Return edges ``[3 F, 2]`` of faces ``[F, 3]``, in each face's direction."""
     return faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)
+
+
+def edges_of(faces: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Find the undirected edges of faces ``[F, 3]``.
+
+    Returns:
+        Corners ``[3 F, 2]``, the smaller index first; index ``[3 F]`` of each among the E different
+        edges; number of faces ``[E]`` of these.
+    """
+    edges = np.sort(directed_edges(faces), axis=1)
+    keys = edges[:, 0] * (faces.max(initial=0) + 1) + edges[:, 1]
+    _, index, counts = np.unique(keys, return_inverse=True, return_counts=True)
+    return edges, index.reshape(-1), counts
 
 
 @dataclass

@@ -45,17 +45,11 @@ def choose_ranks(count: int, each: int) -> dict[int, str]:
     Returns:
         Labels by rank; an object in two groups is listed once.
     """
-    middle = max(0, (count - each) // 2)
-    groups = {
-        "best": range(each),
-        "median": range(middle, middle + each),
-        "worst": range(count - each, count),
-    }
+    starts = {"best": 0, "median": max(0, (count - each) // 2), "worst": count - each}
     labels: dict[int, str] = {}
-    for name, ranks in groups.items():
-        for rank in ranks:
-            if 0 <= rank < count:
-                labels.setdefault(rank, name)
+    for name, start in starts.items():
+        for rank in range(max(0, start), min(start + each, count)):
+            labels.setdefault(rank, name)
     return dict(sorted(labels.items()))
 
 

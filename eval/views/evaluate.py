@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import os
 import sys
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
@@ -140,17 +140,7 @@ def open_job(options: ViewsOptions) -> Job:
             raise UserError(f"{options.data}: contains none of the objects of --protocol gso")
     _check_outputs(options, uids)
     size = gso.SIZE if evaluation else options.size
-    predictions = open_predictions(
-        options.checkpoint,
-        options.distance,
-        device,
-        options.encoder_weights,
-        resize=options.resize_images,
-        margin=options.background_margin,
-        precision=options.precision,
-        detail=options.detail,
-        size=size,
-    )
+    predictions = open_predictions(options, device, size)
     rendered: dict[str, Any] = {}
     if isinstance(predictions, ImagePredictions):
         if options.save_gaussians:
@@ -384,74 +374,48 @@ def sheet_rows(job: Job, records: list[dict[str, Any]], each: int) -> list[Row]:
 
 
 def report_of(job: Job, data: Path, objects: list[dict[str, Any]]) -> dict[str, Any]:
-    """Return the report of ``make_views_report``.
+    """Return the report of ``make_report`` with entries for the baselines.
 
     Args:
         job: shared state.
         data: the dataset, whose name the report holds.
         objects: the records; the missing ones of ``job.missing`` are added.
-    """
-    protocol = asdict(job.protocol) | {
-        "source": job.predictions.source,
-        "data": data.name,
-        **named(job.uids),
-        "baselines": {name: MEANING[name] for name in job.baselines},
-        "contact_sheet": RULE,
-        **({"retrieval_data": job.retrieval_data} if job.retrieval_data else {}),
-    }
-    versions = {"gamba_warp": __version__} | installed("torch", "kornia")
-    every = objects + job.missing
-    return make_views_report(protocol, every, versions, job.left_out, job.failures)
-
-
-def named(uids: Iterable[str]) -> dict[str, Any]:
-    """Return the fields of a protocol that name its objects."""
-    uids = sorted(uids)
-    digest = hashlib.sha256(os.fsencode("\n".join(uids))).hexdigest()
-    return {"uids": uids, "uids_sha256": digest}
-
-
-def make_views_report(
-    protocol: dict[str, Any],
-    objects: list[dict[str, Any]],
-    versions: dict[str, str],
-    left_out: Mapping[str, str],
-    failures: Iterable[dict[str, str]],
-) -> dict[str, Any]:
-    """Return the report of ``make_report`` with entries for the baselines.
-
-    Args:
-        protocol: definition of the numbers, with the objects.
-        objects: their records.
-        versions: of packages by name.
-        left_out: reasons by name, of unavailable baselines.
-        failures: ``{name, reason}`` of failed baselines.
 
     Returns:
         The report, with ``baselines`` (their means), ``left_out_baselines`` (reasons by name), the
         rows ``table`` and ``differences`` of ``table.md``, ``nearly_empty`` (counts of views and
         objects), and ``without_nearly_empty``: both sets of rows without these views.
     """
-    objects = sorted(objects, key=lambda record: record["name"])
+    uids = sorted(job.uids)
+    protocol = asdict(job.protocol) | {
+        "source": job.predictions.source,
+        "data": data.name,
+        "uids": uids,
+        "uids_sha256": hashlib.sha256(os.fsencode("\n".join(uids))).hexdigest(),
+        "baselines": {name: MEANING[name] for name in job.baselines},
+        "contact_sheet": RULE,
+        **({"retrieval_data": job.retrieval_data} if job.retrieval_data else {}),
+    }
+    objects = sorted(objects + job.missing, key=lambda record: record["name"])
     done = [record for record in objects if record["status"] == OK]
     others = {
         name: {r["name"]: r["baselines"][name] for r in done if name in r["baselines"]}
-        for name in protocol["baselines"]
+        for name in job.baselines
     }
     candidates = {"model": {record["name"]: record for record in done}} | others
+    absent = {name: "none of the objects has it" for name in others if not others[name]}
     report = make_report(
         protocol,
         objects,
-        versions,
+        {"gamba_warp": __version__} | installed("torch", "kornia"),
         left_out=("baselines", "num_nearly_empty", "retrieval", "images"),
         baselines={n: mean_of(list(records.values())) for n, records in others.items() if records},
-        left_out_baselines=dict(left_out)
-        | {name: "none of the objects has it" for name, records in others.items() if not records},
+        left_out_baselines=job.left_out | absent,
         **tables_of(candidates),
         nearly_empty=count_nearly_empty(done),
         without_nearly_empty=tables_of(without_nearly_empty(candidates)),
     )
-    unique = {(failure["name"], failure["reason"]) for failure in failures}
+    unique = {(failure["name"], failure["reason"]) for failure in job.failures}
     report["failures"] += [{"name": name, "reason": reason} for name, reason in sorted(unique)]
     return report
 

@@ -7,7 +7,7 @@ from typing import TypeAlias
 
 import torch
 
-from gamba_warp.conventions import Detail, Precision
+from gamba_warp.conventions import Detail
 from gamba_warp.data.dataset import ViewDataset
 from gamba_warp.devices import network_precision, pick_precision
 from gamba_warp.errors import UserError
@@ -17,8 +17,10 @@ from gamba_warp.gaussians import Gaussians
 from gamba_warp.model.checkpoint import FILE_NAME, load_model
 from gamba_warp.model.detail import checked_detail, split_front
 from gamba_warp.model.posing import posed_input
+from gamba_warp.untrusted.ranges import option
 
 from .images import ImagePredictions, holds_images
+from .options import ViewsOptions
 
 
 class PlyPredictions:
@@ -55,29 +57,21 @@ class ModelPredictions:
     they do not split they are the network's, since views of its size have no gaps.
     """
 
-    def __init__(
-        self,
-        path: Path,
-        device: str,
-        encoder_weights: Path | None,
-        margin: int | None = None,
-        precision: Precision = "float32",
-        detail: Detail | None = None,
-        size: int | None = None,
-    ) -> None:
-        self.model, self.device = load_model(path, device, encoder_weights), device
-        self.margin, self.size = margin, size
-        self.detail: Detail | None = detail
-        checked_detail(detail, self.model.config, 0)
-        kind = torch.device(device)
-        self.precision = pick_precision(precision, kind, self.model.config.width)
-        self.distance = self.model.config.distance
+    def __init__(self, options: ViewsOptions, device: str, size: int | None = None) -> None:
+        path = options.checkpoint
+        self.model, self.device = load_model(path, device, options.encoder_weights), device
+        self.margin, self.size = options.background_margin, size
+        self.detail: Detail | None = options.detail
+        config = self.model.config
+        checked_detail(self.detail, config, 0)
+        self.precision = pick_precision(options.precision, torch.device(device), config.width)
+        self.distance = config.distance
         file = path / FILE_NAME if path.is_dir() else path
         self.source = {"kind": "checkpoint", "path": path.name, "sha256": sha256(file)}
-        if self.model.config.decoder == "rays":
-            self.source["detail"] = "as the image has pixels" if detail is None else str(detail)
-        if margin is not None:
-            self.source["background_margin"] = str(margin)
+        if config.decoder == "rays":
+            self.source["detail"] = str(self.detail or "as the image has pixels")
+        if self.margin is not None:
+            self.source["background_margin"] = str(self.margin)
         if self.precision != torch.float32:
             self.source["precision"] = str(self.precision).removeprefix("torch.")
 
@@ -102,51 +96,32 @@ class ModelPredictions:
 Predictions: TypeAlias = PlyPredictions | ModelPredictions | ImagePredictions
 
 
-def open_predictions(
-    path: Path,
-    distance: float,
-    device: str,
-    encoder_weights: Path | None = None,
-    resize: bool = False,
-    margin: int | None = None,
-    precision: Precision = "float32",
-    detail: Detail | None = None,
-    size: int | None = None,
-) -> Predictions:
+def open_predictions(options: ViewsOptions, device: str, size: int | None = None) -> Predictions:
     """Open a folder with ``.ply`` files or with images, else a checkpoint.
 
     Args:
-        path: the folder or the checkpoint.
-        distance: of the reference camera, for ``.ply`` files; a checkpoint states its own.
+        options: with the folder or the checkpoint, and what it takes.
         device: torch device.
-        encoder_weights: as for ``load_model``.
-        resize: resize images of another size.
-        margin: ``background_margin`` of a model, see ``Gamba.forward``.
-        precision: of a model's matrix products, see ``devices.pick_precision``.
-        detail: of a model's front, see ``model.predict.reconstruct``.
         size: height of the compared images; None: the files' height.
 
     Raises:
-        UserError: ``path`` is missing, the checkpoint cannot be read, or a margin, a precision or a
-            detail is given without a model that takes it.
+        UserError: it is missing or cannot be read, or a margin, a precision or a detail is given
+            without a model that takes it.
     """
+    path = options.checkpoint
     if not path.exists():
         raise UserError(f"{path}: no such checkpoint, folder of .ply files or of images")
     if path.is_dir() and next(visible(path, "*.ply"), None) is not None:
-        found = PlyPredictions(path, distance, device)
+        found = PlyPredictions(path, options.distance, device)
     elif path.is_dir() and next(path.glob("*.safetensors"), None) is None:
         if not holds_images(path):
             raise UserError(
                 f"{path}: holds neither .ply files nor folders of images nor a checkpoint"
             )
-        found = ImagePredictions(path, distance, device, resize)
+        found = ImagePredictions(path, options.distance, device, options.resize_images)
     else:
-        return ModelPredictions(path, device, encoder_weights, margin, precision, detail, size)
-    for name, given in (
-        ("--background-margin", margin is not None),
-        ("--precision", precision != "float32"),
-        ("--detail", detail is not None),
-    ):
-        if given:
-            raise UserError(f"{name}: {path} holds no model")
+        return ModelPredictions(options, device, size)
+    for name in ("background_margin", "precision", "detail"):
+        if getattr(options, name) != getattr(ViewsOptions, name):
+            raise UserError(f"{option(name)}: {path} holds no model")
     return found

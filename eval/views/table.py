@@ -10,12 +10,13 @@ import numpy as np
 from gamba_warp.image_metrics import METRICS, all_figures, on_grounds
 
 from ..averages import LEVEL, bootstrap, minus, summary_of
-from ..tables import Column, Row, figures, markdown
+from ..tables import Column, Row, columns_of, figures, markdown
 from .compare import NEARLY_EMPTY
 
 Record = dict[str, Any]
 Records = dict[str, Record]  # uid -> result of summary()
 Rows = list[dict[str, Any]]
+Columns = dict[str, Column]
 MEAN_ERROR = "psnr_of_mean_error"
 
 
@@ -88,24 +89,24 @@ def without_nearly_empty(candidates: dict[str, Records]) -> dict[str, Records]:
     }
 
 
-def means(rows: Rows, signed: bool = False) -> str:
-    """Return a Markdown table of the rows' means on white, with intervals.
+def means(
+    rows: Rows, signed: bool = False, columns: Columns | None = None, of: str = "mean"
+) -> str:
+    """Return a Markdown table of rows, with intervals.
 
     Args:
         rows: from ``table_of`` or ``differences_of``.
-        signed: positive means get a plus sign.
+        signed: positive figures get a plus sign.
+        columns: by figure; None: those on white.
+        of: statistic shown, "mean" or "median".
     """
-    return _markdown(rows, signed, {key: Column(m.head, m.digits) for key, m in METRICS.items()})
-
-
-def _markdown(rows: Rows, signed: bool, columns: dict[str, Column], of: str = "mean") -> str:
     shown = []
     for row in rows:
         error = row[MEAN_ERROR]  # neither mean nor median; shown next to the medians
         error = {"median": error["value"], "median_interval": error["interval"]}
         names = row["views"], row["name"], str(row["objects"])
         shown.append(Row(names, row | {MEAN_ERROR: error}, signed))
-    return markdown(figures(["views", "", "objects"], columns, shown, of))
+    return markdown(figures(["views", "", "objects"], columns or columns_of(METRICS), shown, of))
 
 
 def page(report: dict[str, Any]) -> str:
@@ -125,14 +126,13 @@ def page(report: dict[str, Any]) -> str:
         f"Means over objects of means over views, with {100 * LEVEL:g} % bootstrap intervals over "
         f"objects. LPIPS: less is better.{f' LPIPS left out: {lpips}.' if lpips else ''} {note}"
     ]
-    white = {key: Column(m.head, m.digits) for key, m in METRICS.items()}
-    grounds = {key: Column(m.head, m.digits) for key, m in on_grounds().items()}
+    white = columns_of(METRICS)
     medians = {MEAN_ERROR: Column("PSNR of mean error [dB]", METRICS["psnr"].digits)}
     medians |= {key: Column(f"median {title}", digits) for key, (title, digits) in white.items()}
     more = [
         (
             "The same on black and on grey, both sides composited by their alpha; means:",
-            *(report, grounds, "mean"),
+            *(report, columns_of(on_grounds()), "mean"),
         ),
         (
             "PSNR of the mean squared error over all views and objects; medians over objects:",
@@ -148,6 +148,6 @@ def page(report: dict[str, Any]) -> str:
             [row for row in part[key] if row["views"] == part[key][0]["views"]]
             for key in ("table", "differences")
         )
-        parts += [title, _markdown(rows, False, columns, of)] if rows else []
-        parts += [_markdown(gains, True, columns, of)] if gains else []
+        parts += [title, means(rows, False, columns, of)] if rows else []
+        parts += [means(gains, True, columns, of)] if gains else []
     return "\n\n".join(parts) + "\n"

@@ -8,10 +8,8 @@ from __future__ import annotations
 import shlex
 import signal
 from pathlib import Path
-from typing import Annotated
 
 import tyro
-from msgspec import Meta
 
 from ..batch import counted, say
 from ..conventions import DeviceChoice
@@ -19,7 +17,7 @@ from ..errors import UserError, one_line
 from ..files import only_process, output_folder, write_json, write_text
 from ..processes import run_gamba, stop_requests
 from ..untrusted.documents import read_document
-from ..untrusted.ranges import Minutes, Seed, Threads, ranged
+from ..untrusted.ranges import Seed, Threads, ranged
 
 _TAIL = 1 << 14  # bytes of a log searched for the error
 
@@ -31,8 +29,6 @@ def ablate_command(
     out: Path | None = None,
     rows: tuple[str, ...] = (),
     seeds: tuple[Seed, ...] = (),
-    steps: Annotated[int, Meta(ge=1, le=10**12)] | None = None,
-    minutes: Minutes | None = None,
     threads: Threads | None = None,
     device: DeviceChoice = "auto",
     dry_run: bool = False,
@@ -49,8 +45,6 @@ def ablate_command(
         out: Folder of the results; by default out/ablation/NAME of the plan.
         rows: Only these rows; all by default.
         seeds: Seeds of every row, in place of the plan's.
-        steps: Training steps of every row, in place of the plan's budget.
-        minutes: Training time of every row, in place of the plan's budget.
         threads: CPU threads of the training; all cores by default.
         device: Device of every command; auto is the GPU if there is one.
         dry_run: Only print the commands.
@@ -59,10 +53,6 @@ def ablate_command(
     from .plan import commands, open_plan
 
     chosen = open_plan(plan, data)
-    if steps is not None and minutes is not None:
-        raise UserError("--steps and --minutes: give one of them")
-    given = {"steps": steps, "minutes": minutes}
-    budget = {name: value for name, value in given.items() if value is not None} or None
     wanted = [chosen.row(name) for name in dict.fromkeys(rows)] or chosen.rows
     out = Path("out/ablation") / chosen.name if out is None else out
     tasks = {}
@@ -70,9 +60,8 @@ def ablate_command(
     for seed in dict.fromkeys(seeds or chosen.seeds):
         for row in wanted:
             folder = out / "rows" / row.name / f"seed-{seed}"
-            words = commands(chosen, row, data, folder, budget)
-            words["run/model.safetensors"] += ["--seed", str(seed)]
-            words["run/model.safetensors"] += ["--threads", str(threads)] if threads else []
+            more = ["--seed", str(seed), *(["--threads", str(threads)] if threads else [])]
+            words = commands(chosen, row, data, folder, more)
             tasks[folder] = {file: [*w, "--device", device] for file, w in words.items()}
     if dry_run:
         for words in (words for task in tasks.values() for words in task.values()):

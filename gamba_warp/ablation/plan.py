@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import json
 import shlex
+from collections.abc import Sequence
 from dataclasses import fields
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import Annotated, Any, Literal
 
 import msgspec
 from msgspec import Meta
@@ -14,18 +15,14 @@ from msgspec import Meta
 from ..errors import UserError
 from ..image_metrics import METRICS
 from ..untrusted.documents import parse_document, read_bytes
-from ..untrusted.names import plain_name
 from ..untrusted.ranges import Seed
-
-if TYPE_CHECKING:
-    from gamba_warp.train.config import TrainConfig
 
 PLANS = Path(__file__).parent / "plans"
 MAX_PLAN = 1 << 20  # bytes; the shipped plans have 5,000
 # Set by the command for all rows, or they would give rows different samples.
 RESERVED = ("data", "set", "preset", "out", "config", "resume", "init", "seed", "device")
 RESERVED += ("threads",)
-BUDGET = ("steps", "minutes")
+BUDGET = {"steps", "minutes"}
 
 _Name = Annotated[str, Meta(pattern=r"^[a-z0-9][a-z0-9_-]{0,59}\Z")]
 _Text = Annotated[str, Meta(max_length=1000)]
@@ -142,25 +139,24 @@ def open_plan(text: str, data: Path) -> Plan:
     try:
         _check(plan)
         for row in plan.rows:
-            train_config(plan, row, data)
+            commands(plan, row, data, Path())
     except UserError as error:
         raise UserError(f"{path}: {error}") from error
     return plan
 
 
 def _check(plan: Plan) -> None:
-    plain_name(plan.name, "name")
     for text in (plan.title, plan.note, *(t for row in plan.rows for t in (row.title, row.note))):
         if not text.isprintable():  # a table has lines
             raise UserError(f"{text[:80]!r}: a title or note has an unprintable character")
-    names = [plain_name(row.name, "row") for row in plan.rows]
+    names = [row.name for row in plan.rows]
     for row in plan.rows:
         if names.count(row.name) > 1:
             raise UserError(f"row {row.name}: duplicate name")
         if unknown := row.paper.keys() - {*METRICS}:
             known = ", ".join(METRICS)
             raise UserError(f"row {row.name}: paper: unknown metric {min(unknown)}; known: {known}")
-        if budget := [name for name in BUDGET if name in _merged(row.options)]:
+        if budget := [name for name in BUDGET if name in row.options]:
             raise UserError(f"row {row.name}: {budget[0]}: the budget is the same for every row")
     if len({*plan.seeds}) != len(plan.seeds):
         raise UserError("a seed is given twice")
@@ -174,50 +170,8 @@ def _merged(*groups: _Values) -> _Values:
     return {name: value for name, value in both.items() if value is not None}
 
 
-def train_config(
-    plan: Plan, row: Row, data: Path, budget: dict[str, float] | None = None
-) -> TrainConfig:
-    """Return the options of a row's training.
-
-    Args:
-        plan: the plan.
-        row: one of its rows.
-        data: the dataset.
-        budget: ``steps`` or ``minutes`` in place of the plan's; None: the plan's.
-
-    Raises:
-        UserError: an option is unknown, its value is invalid, or there is no single budget; names
-            the row.
-    """
-    from gamba_warp.train.config import GROUPS, config_of
-
-    source = f"row {row.name}"
-    of = {f.name: group for group, kind in GROUPS.items() for f in fields(kind) if group != "model"}
-    changes = _merged(plan.base.set, row.set)
-    for name in changes.keys() - {field.name for field in fields(GROUPS["model"])}:
-        raise UserError(f"{source}: set: GambaConfig has no field {name}")
-    options = _merged(plan.base.options, row.options)
-    if budget:
-        options = {name: v for name, v in options.items() if name not in BUDGET} | budget
-    if len(options.keys() & {*BUDGET, "epochs"}) != 1 or "epochs" in options:
-        raise UserError("the budget of a row: expected either steps or minutes")
-    values: dict[str, Any] = {
-        "data": str(data),
-        "preset": plan.base.preset,
-        "set": [f"{n}={v if isinstance(v, str) else json.dumps(v)}" for n, v in changes.items()],
-    }
-    for name, value in options.items():
-        if name in RESERVED:
-            raise UserError(f"{source}: options: {name} cannot be set by a plan")
-        for item in value if isinstance(value, list) else [value]:
-            if isinstance(item, str) and (item.startswith("-") or not item.isprintable()):
-                raise UserError(f"{source}: {name}: {item!r} is not a valid value of an option")
-        values.setdefault(of.get(name, "run"), {})[name] = value
-    return config_of(values, source)
-
-
 def commands(
-    plan: Plan, row: Row, data: Path, folder: Path, budget: dict[str, float] | None
+    plan: Plan, row: Row, data: Path, folder: Path, more: Sequence[str] = ()
 ) -> dict[str, list[str]]:
     """Return the words of a row's training and of its evaluation, by the file that each makes.
 
@@ -226,12 +180,34 @@ def commands(
         row: one of its rows.
         data: the dataset.
         folder: of the row with one seed.
-        budget: as for ``train_config``.
-    """
-    from gamba_warp.train.config import command_line
+        more: further words of the training.
 
-    config = train_config(plan, row, data, budget)
-    training = shlex.split(command_line(config.to_dict()))[1:]
+    Raises:
+        UserError: an option is unknown, its value is invalid, or there is no single budget; names
+            the row.
+    """
+    from gamba_warp.train.config import GROUPS, command_line, config_of
+
+    source = f"row {row.name}"
+    of_model = {field.name for field in fields(GROUPS["model"])}
+    groups = {f.name: group for group in GROUPS if group != "model" for f in fields(GROUPS[group])}
+    changes, options = _merged(plan.base.set, row.set), _merged(plan.base.options, row.options)
+    if unknown := changes.keys() - of_model:
+        raise UserError(f"{source}: set: GambaConfig has no field {min(unknown)}")
+    if len(options.keys() & BUDGET) != 1 or "epochs" in options:
+        raise UserError("the budget of a row: expected either steps or minutes")
+    values: dict[str, Any] = {"data": str(data), "preset": plan.base.preset}
+    values["set"] = [
+        f"{n}={v if isinstance(v, str) else json.dumps(v)}" for n, v in changes.items()
+    ]
+    for name, value in options.items():
+        if name in RESERVED:
+            raise UserError(f"{source}: options: {name} cannot be set by a plan")
+        for item in value if isinstance(value, list) else [value]:
+            if isinstance(item, str) and (item.startswith("-") or not item.isprintable()):
+                raise UserError(f"{source}: {name}: {item!r} is not a valid value of an option")
+        values.setdefault(groups.get(name, "run"), {})[name] = value
+    training = shlex.split(command_line(config_of(values, source).to_dict()))[1:]
     of, model = plan.evaluation, folder / "run" / "model.safetensors"
     views: list[object] = ["eval-views", "--checkpoint", model, "--data", data, "--split", of.split]
     views += ["--limit", of.objects, "--views", of.views, *(["--size", of.size] if of.size else [])]
@@ -239,6 +215,6 @@ def commands(
     if row.background_margin is not None:
         views += ["--background-margin", row.background_margin]
     return {
-        "run/model.safetensors": [*training, "--out", str(folder / "run")],
+        "run/model.safetensors": [*training, "--out", str(folder / "run"), *more],
         "views/report.json": [*map(str, views)],
     }

@@ -13,15 +13,7 @@ from ..devices import pick_device
 from ..errors import UserError
 from ..files import output_folder
 from ..pages.options import EXPORTED, FileOptions
-from ..surfaces.options import (
-    Holes,
-    PartFraction,
-    Pixels,
-    Smoothing,
-    SurfaceOptions,
-    Views,
-    Voxels,
-)
+from ..surfaces.options import Pixels, SurfaceOptions, Views, Voxels
 from ..untrusted.ranges import Distance, Elevation, Fov, ranged
 from .results import Results, reported
 
@@ -36,11 +28,7 @@ def export_command(
     voxels: Voxels = 128,
     views: Views = 64,
     pixels: Pixels = 256,
-    colors: bool = True,
-    close_holes: Holes = 30,
-    min_component: PartFraction = 0.01,
     largest: bool = False,
-    smooth: Smoothing = 0,
     elevation: Elevation = 0.0,
     fov: Fov | None = None,
     distance: Distance | None = None,
@@ -60,11 +48,7 @@ def export_command(
         voxels: Number of voxels along the object's longest side.
         views: Number of views around the object, for depth and colours.
         pixels: Side of these views, pixels.
-        colors: Give the vertices colours (.stl has none).
-        close_holes: Largest number of edges of holes that are closed.
-        min_component: Remove parts with a smaller fraction of the faces.
         largest: Keep the largest part only.
-        smooth: Number of smoothing steps.
         elevation: Elevation of the camera of turntable and 3D viewer above the object, degrees.
         fov: Its field of view, degrees; 49.1 by default. Without --distance the object keeps its
             size in the image.
@@ -79,17 +63,7 @@ def export_command(
     from ..pipeline import Object, ObjectFiles
     from ..trajectories.paths import Viewpoint
 
-    options = SurfaceOptions(
-        method=surface,
-        voxels=voxels,
-        views=views,
-        pixels=pixels,
-        colors=colors,
-        close_holes=close_holes,
-        min_component=min_component,
-        largest=largest,
-        smooth=smooth,
-    )
+    options = SurfaceOptions(surface, voxels, views, pixels, largest=largest, colors=True)
     view = Viewpoint().changed(elevation, distance, fov)
     outputs = ObjectFiles(options=files, surface=options, device=pick_device(device))
     if not outputs.suffixes():

@@ -33,7 +33,6 @@ BENCH = {
 STRESS = {
     "scan": ("gamba_warp.kernels.cases.scan", "gamba_warp.kernels.cases.conv"),
     "raster": ("gamba_warp.kernels.cases.raster",),
-    "model": ("gamba_warp.measure.stress",),
 }
 
 
@@ -81,7 +80,7 @@ def bench_command(
 
     from ..kernels.bench.measure import Settings, measure
     from ..kernels.bench.peers import versions
-    from ..kernels.bench.report import busy_line, charts, markdown
+    from ..kernels.bench.report import busy_line, charts, failures, markdown
 
     if quick and full:
         raise UserError("--quick and --full: choose one")
@@ -107,9 +106,8 @@ def bench_command(
     write_text(folder / "bench.md", markdown(document))
     for op, chart in charts(document).items():
         write_text(folder / f"bench-{op}.svg", chart)
-    failed = [r for r in document["records"] if r["status"].startswith(("failed", "check"))]
-    for r in failed:
-        print(f"{r['op']}: {r['case']}: {r['variant']}, {r['direction']}: {r['status']}")
+    failed = failures(document)
+    print(*(f"{line}\n" for line in failed), sep="", end="")
     measured = sum(r["status"] == "ok" for r in document["records"])
     print(f"{measured} measured; wrote {folder / 'bench.json'}, bench.md and charts")
     if line := busy_line(document):
@@ -138,13 +136,13 @@ def stress_command(
     threads: Threads | None = None,
     out: Path = Path("out/stress"),
 ) -> int:
-    """Compare kernels and model with float64 on random and hostile cases.
+    """Compare kernels with float64 on random and hostile cases.
 
     Checks forward results and all gradients. A failing case is made smaller. Writes stress.json and
     stress.md. Ctrl-C keeps the results so far.
 
     Args:
-        what: scan (with the convolution), raster, model, or all (of these).
+        what: scan (with the convolution), raster, or all (of these).
         seed: The same seed gives the same cases in the same order.
         minutes: Time limit; by default 1, or none with --cases.
         cases: Number of cases of each operator; by default as many as fit in --minutes.

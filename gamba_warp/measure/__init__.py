@@ -1,1 +1,1 @@
-"""Benchmark and stress cases that need the model."""
+"""Benchmark cases that need the model, and the state of a machine."""

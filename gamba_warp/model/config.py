@@ -281,7 +281,7 @@ class GambaConfig:
             UserError: the text is not JSON, a key is unknown or missing, or a value has the wrong
                 type or range.
         """
-        from ..untrusted.documents import parse_document  # gpu_check has no msgspec
+        from ..untrusted.documents import parse_document  # `make gpu` has no msgspec
 
         where = f"{source}: the model's configuration"
         values = parse_document(text, dict[str, Any], where)

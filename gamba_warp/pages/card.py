@@ -14,16 +14,13 @@ import msgspec
 from msgspec import Meta
 
 from ..errors import UserError
-from ..image_metrics import METRICS as OF_VIEWS
-from ..image_metrics import all_figures, on_grounds
+from ..image_metrics import all_figures
 from ..untrusted.documents import read_document
 
 _LIMIT = 1 << 20  # bytes; a card usually has a few kB
 _Text = Annotated[str, Meta(max_length=2000)]
 _Count = Annotated[int, Meta(ge=0, le=10**12)]
 _Name = Annotated[str, Meta(max_length=80)]
-OF_IMAGES = {key: metric.head for key, metric in OF_VIEWS.items()}
-OF_GROUNDS = {key: metric.head for key, metric in on_grounds().items()}
 # Title and decimals of each metric.
 METRICS = {
     **{key: (metric.head, metric.digits) for key, metric in all_figures().items()},
@@ -43,12 +40,6 @@ class Figure(msgspec.Struct, frozen=True, omit_defaults=True):
 
     mean: float
     interval: tuple[float, float] | None = None
-
-    def text(self, digits: int) -> str:
-        """Format the mean, and in brackets the interval, with the given decimals."""
-        low_high = self.interval or ()
-        between = ", ".join(f"{value:.{digits}f}" for value in low_high)
-        return f"{self.mean:.{digits}f}" + (f" [{between}]" if between else "")
 
 
 class _Row(msgspec.Struct, frozen=True, omit_defaults=True):

@@ -4,11 +4,10 @@ from __future__ import annotations
 
 import base64
 import io
-import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from markupsafe import Markup
@@ -21,10 +20,6 @@ from ..trajectories.movies import SECONDS
 from ..trajectories.paths import Viewpoint
 from ..viewer.page import POLICY, frame_element, frames_script
 from .templates import render
-
-_NUMBER = re.compile(r"[-+]?[0-9][0-9.,e+-]*( %| to [0-9.,e+-]+)?")
-_ABSENT = ("", "-", "absent")
-_WITH_INTERVAL = re.compile(r"([-+]?[0-9][0-9.,e+-]*) (\[.*\])")
 
 
 @dataclass
@@ -39,13 +34,9 @@ class Section:
         gaussians: one object ``[N]``, for the 3D viewer.
         mesh: its surface, with ``vertices``, ``faces`` and ``colors``, for the viewer; or None.
         strip: one wide image ``[H, W, 3]``, floats in [0, 1].
-        views: images ``[V, H, W, 3]``, floats in [0, 1], by label; each label is a row of views,
-            such as "Predicted" above "Truth".
         links: thumbnails ``[H, W, 3]`` uint8 by name, which link to NAME.html in the page's folder.
         files: names of files in the page's folder, for download.
-        table: rows of cells; text is left-aligned, numbers right-aligned. Below a header, texts of
-            numbers count as numbers, ``1.0 [0.5, 1.5]`` as one with its interval.
-        header: names of the table's columns.
+        table: labels and texts.
         details: long texts by name, initially hidden.
         view: initial camera of the viewer; with an image, the image's.
     """
@@ -57,44 +48,38 @@ class Section:
     gaussians: Gaussians | None = None
     mesh: Any = None
     strip: np.ndarray | None = None
-    views: Mapping[str, np.ndarray] = field(default_factory=dict)
     links: Mapping[str, np.ndarray] = field(default_factory=dict)
     files: Sequence[str] = ()
-    table: Sequence[Sequence[str | int | float]] = ()
-    header: Sequence[str] = ()
+    table: Sequence[tuple[str, str]] = ()
     details: Mapping[str, str] = field(default_factory=dict)
     view: Viewpoint = Viewpoint()
-
-
-def page_text(title: str, text: str, sections: Sequence[Section], auto: bool = False) -> str:
-    """Return a whole page.
-
-    Args:
-        title: heading of the page.
-        text: below it; an empty line separates paragraphs.
-        sections: in order.
-        auto: viewers are large and start by themselves, and sections have no headings.
-    """
-    viewers = any(section.gaussians is not None for section in sections)
-    return render(
-        "page.html",
-        **{"title": title, "text": text, "sections": sections, "auto": auto, "policy": POLICY},
-        style=Markup((Path(__file__).parent / "page.css").read_text(encoding="utf-8")),
-        script=Markup(frames_script() if viewers else ""),
-        **{"image": _image, "animation": _animation, "viewer": _viewer, "cells": _cells},
-        paragraphs=lambda text: filter(None, text.split("\n\n")),
-    )
 
 
 def write_page(
     path: str | Path, title: str, sections: Sequence[Section], text: str = "", auto: bool = False
 ) -> None:
-    """Write ``page_text`` to a file, atomically; arguments as there.
+    """Write a whole page, atomically.
+
+    Args:
+        path: the ``.html``.
+        title: heading of the page.
+        sections: in order.
+        text: below the heading; an empty line separates paragraphs.
+        auto: viewers are large and start by themselves, and sections have no headings.
 
     Raises:
         UserError: the file cannot be written.
     """
-    write_text(path, page_text(title, text, sections, auto))
+    viewers = any(section.gaussians is not None for section in sections)
+    page = render(
+        "page.html",
+        **{"title": title, "text": text, "sections": sections, "auto": auto, "policy": POLICY},
+        style=Markup((Path(__file__).parent / "page.css").read_text(encoding="utf-8")),
+        script=Markup(frames_script() if viewers else ""),
+        **{"image": _image, "animation": _animation, "viewer": _viewer},
+        paragraphs=lambda text: filter(None, text.split("\n\n")),
+    )
+    write_text(path, page)
 
 
 def _image(image: np.ndarray, label: str, css: str = "", kind: str = "PNG") -> str:
@@ -136,30 +121,3 @@ def _viewer(section: Section, number: int, poster: str, auto: bool) -> str:
         **{which: section.view.camera},
     )
     return Markup(element)
-
-
-class _Cell(NamedTuple):
-    text: str
-    kind: str = ""
-    interval: str = ""
-
-
-def _cells(section: Section) -> list[list[_Cell]]:
-    """Return the cells of the header and the table (``Section.table``)."""
-
-    def cell(value: str | int | float) -> _Cell:
-        if not isinstance(value, str):
-            return _Cell(f"{value:,}" if isinstance(value, int) else f"{value:.4g}", "number")
-        if section.header and _NUMBER.fullmatch(value):
-            return _Cell(value, "number")
-        if section.header and (found := _WITH_INTERVAL.fullmatch(value)):
-            return _Cell(found[1], "", found[2])
-        return _Cell(value)
-
-    columns = [[cell(value) for value in column] for column in zip(*section.table)]
-    for column in columns:  # missing values are aligned like numbers
-        if section.header and any(cell.kind == "number" for cell in column):
-            column[:] = [c._replace(kind="number") if c.text in _ABSENT else c for c in column]
-    heads = [[cell.kind for cell in column].count("number") * 2 > len(column) for column in columns]
-    head = [_Cell(text, "number" * right) for text, right in zip(section.header, heads)]
-    return [head, *map(list, zip(*columns))]

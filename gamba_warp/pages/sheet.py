@@ -12,7 +12,7 @@ from ..data.preprocess import resize_rgba
 from ..errors import UserError
 from ..files import atomic_path
 from ..gaussians import Gaussians
-from ..images import load_rgba, to_uint8
+from ..images import to_uint8
 from ..trajectories.movies import turntable_frames
 from ..trajectories.paths import Viewpoint
 
@@ -75,23 +75,3 @@ class Sheet:
             draw.line((x + _TILE, y + _LABEL, x + _TILE, y + high - 1), "#cccccc")
         with atomic_path(self.path) as temporary:
             sheet.save(temporary, quality=88)  # ignored for PNG
-
-
-def tiles(path: Path, columns: int = 3) -> np.ndarray:
-    """Return the views of a strip of an evaluation or a fit: square ones in columns.
-
-    Args:
-        path: the image.
-        columns: of views.
-
-    Returns:
-        ``[columns, V, S, S, 3]`` in [0, 1]; for ``gamba eval-views`` input, prediction and ground
-        truth.
-
-    Raises:
-        UserError: the image cannot be read.
-        ValueError: its views are not square.
-    """
-    rgb = load_rgba(path)[..., :3]
-    side = rgb.shape[1] // columns
-    return rgb.reshape(-1, side, columns, side, 3).transpose(2, 0, 1, 3, 4)

@@ -136,7 +136,5 @@ def placed(cameras: Cameras, center: Tensor, side: float) -> Cameras:
 
 def to_unit(cameras: Cameras, center: Tensor, side: float) -> Cameras:
     """Convert cameras from an object's own frame to its unit frame, the inverse of ``placed``."""
-    viewmats = cameras.viewmats.double().clone()
-    shift = (viewmats[..., :3, :3] @ center.double().cpu()[:, None])[..., 0]
-    viewmats[..., :3, 3] = (viewmats[..., :3, 3] + shift) / side
-    return replace(cameras, viewmats=viewmats.float(), Ks=cameras.Ks.float())
+    unit = placed(cameras, -center.double() / side, 1 / side)
+    return replace(unit, viewmats=unit.viewmats.float(), Ks=unit.Ks.float())

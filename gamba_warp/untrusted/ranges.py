@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 else:
     try:
         from msgspec import Meta
-    except ImportError:  # gpu_check needs only torch, numpy, warp-lang and pytest
+    except ImportError:  # `make gpu` needs only torch, numpy, warp-lang and pytest
 
         @dataclass(frozen=True, kw_only=True)
         class Meta:

@@ -113,6 +113,15 @@ def busy_line(document: dict) -> str:
     )
 
 
+def failures(document: dict) -> list[str]:
+    """Return a line for each wrong result, and for each that could not be computed."""
+    return [
+        f"{r['op']}: {r['case']}: {r['variant']}, {r['direction']}: {r['status']}"
+        for r in document["records"]
+        if r["status"].startswith(("failed", "check"))
+    ]
+
+
 def markdown(document: dict) -> str:
     """Return a page with a table for each case."""
     level = document["settings"]["level"]

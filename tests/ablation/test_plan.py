@@ -66,7 +66,6 @@ def test_errors_end_the_command_before_it_writes(tmp_path, capsys, monkeypatch):
         ([bad, data], "row b"),
         (["tabel2", data], "no such plan; give ours, paper-table2, questions"),
         ([path, data, "--rows", "z"], "has no row z; it has a"),
-        ([path, data, "--steps", "1", "--minutes", "1"], "give one of them"),
     ):
         refused_command(capsys, "ablate", words, reason)
     assert {path.name for path in tmp_path.iterdir()} == {"trial.json", "bad.json"}
@@ -77,12 +76,12 @@ def test_the_row_changes_the_base(tmp_path):
     row["background_margin"] = 0
     base = {"options": {"minutes": 3, "lr": 0.5, "novel_weight": 2, "extra": ["x", "y"]}}
     chosen = open_plan(str(write_plan(tmp_path, "a", row, base=base)), tmp_path / "data")
-    made = [commands(chosen, r, tmp_path, tmp_path, {"minutes": 1.5}) for r in chosen.rows]
+    made = [commands(chosen, r, tmp_path, tmp_path) for r in chosen.rows]
     (first, views), (second, dropped) = (words.values() for words in made)
     assert first[2:6] == ["--preset", "tiny", "--set", "width=16"]
     assert "--lr" in first and "--lr" not in second and "--no-radial-mask" in second
     assert second[second.index("--set") :][1:3] == ["width=16", "depth=2"]
-    assert second[second.index("--minutes") + 1] == "1.5" and second.count("--minutes") == 1
+    assert second[second.index("--minutes") + 1] == "3.0" and second.count("--minutes") == 1
     assert second[second.index("--extra") :][1:3] == ["x", "y"]
     assert second[-2:] == ["--out", str(tmp_path / "run")]
     assert "--background-margin" not in views

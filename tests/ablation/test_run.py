@@ -79,7 +79,7 @@ def test_rows_run_once_and_have_these_figures(gamba, tmp_path, capsys):
     assert "23.00 [21.00, 25.00]" in text and "12.72" in text and "b: Why." in text
     assert "+1.00 [1.00, 1.00]" in text and "1.4 " in text
     assert gamba(path) == (0, []), "finished work is not done again"
-    assert gamba(path, "--steps", 5) == (2, [])
+    assert gamba(path, "--threads", 5) == (2, [])
     assert "seed-0: was run with other options" in capsys.readouterr().err
     code, called = gamba(path, "--rows", "b", "--seeds", 5)
     assert code == 0 and called == ["train b/5", "eval-views b/5"]

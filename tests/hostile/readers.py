@@ -129,7 +129,7 @@ def _training(path: Path, out: Path) -> Any:
 def _plan(path: Path, out: Path) -> Any:
     """The plan of an ablation, and the commands of its rows."""
     found = open_plan(str(path), path.parent)
-    return found, [commands(found, row, path.parent, out, None) for row in found.rows]
+    return found, [commands(found, row, path.parent, out) for row in found.rows]
 
 
 def _compare(path: Path, out: Path) -> Any:

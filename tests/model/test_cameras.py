@@ -15,6 +15,7 @@ from gamba_warp.cameras import Cameras, intrinsics, orbit, reference_viewmat, vi
 from gamba_warp.data.dataset import open_dataset
 from gamba_warp.errors import UserError
 from gamba_warp.eval.views.compare import ViewsProtocol, load_gt
+from gamba_warp.eval.views.options import ViewsOptions
 from gamba_warp.eval.views.predictions import ModelPredictions, open_predictions
 from gamba_warp.formats.ply import save_ply
 from gamba_warp.gaussians import quat_multiply
@@ -202,7 +203,8 @@ def test_training_and_evaluation_see_the_same_input(dataset, tmp_path, monkeypat
 
     (tmp_path / "model").mkdir()
     save_model(tmp_path / "model" / "model.safetensors", Gamba(CONFIG))
-    predictions = ModelPredictions(tmp_path / "model", "cpu", None)
+    options = ViewsOptions(checkpoint=tmp_path / "model", data=tmp_path)
+    predictions = ModelPredictions(options, "cpu")
     seen = []
     run = predictions.model.forward
 
@@ -225,7 +227,8 @@ def test_an_evaluation_states_the_precision_of_its_model(dataset, tmp_path):
     save_model(model, Gamba(CONFIG))
     uid, made = dataset.uids[0], {}
     for precision in ("float32", "bfloat16"):
-        predictions = open_predictions(model, 1.5, "cpu", precision=precision)
+        options = ViewsOptions(checkpoint=model, data=tmp_path, precision=precision)
+        predictions = open_predictions(options, "cpu")
         made[precision] = predictions.gaussians(dataset, uid, 4).means
         said = predictions.source.get("precision")
         assert said == (None if precision == "float32" else precision)
@@ -233,4 +236,4 @@ def test_an_evaluation_states_the_precision_of_its_model(dataset, tmp_path):
     (tmp_path / "plys").mkdir()
     save_ply(tmp_path / "plys" / "a.ply", some(3))
     with pytest.raises(UserError, match="--precision: .*plys holds no model"):
-        open_predictions(tmp_path / "plys", 1.5, "cpu", precision="auto")
+        open_predictions(replace(options, checkpoint=tmp_path / "plys"), "cpu")

@@ -62,7 +62,7 @@ assert autograd.__name__.endswith("causal_conv1d.autograd")
 """
     orders = []
     for module in BESIDE:
-        modules = f"import {module}\nimport gamba_warp.measure.stress"
+        modules = f"import {module}\nimport gamba_warp.measure.models"
         for order in ((modules, names, modules), (names, modules, names)):
             orders.append("\n".join([*order, code]))
     forks = """

@@ -18,12 +18,13 @@ import msgspec
 
 from gamba_warp.errors import UserError
 from gamba_warp.files import write_json, write_text
+from gamba_warp.image_metrics import METRICS as OF_IMAGES
+from gamba_warp.image_metrics import on_grounds
+from gamba_warp.kernels.runtime.tables import cell as figure
 from gamba_warp.kernels.runtime.tables import markdown
 from gamba_warp.model.checkpoint import DEFAULT_CHECKPOINT
 from gamba_warp.pages.card import (
     METRICS,
-    OF_GROUNDS,
-    OF_IMAGES,
     ModelCard,
     Row,
     card_path,
@@ -121,10 +122,10 @@ def readme_of(text: str, card: ModelCard) -> str:
 
 
 def _tables(card: ModelCard) -> list[str]:
-    tables, first = [], [key for key in METRICS if key not in OF_GROUNDS]
+    tables, first = [], [key for key in METRICS if key not in on_grounds()]
     for views, title in TITLES.items():
         rows = [row for row in card.figures if row.views == views]
-        both = [(first, ""), (OF_GROUNDS, " on other grounds")]
+        both = [(first, ""), ([*on_grounds()], " on other grounds")]
         if views == "input":  # trivial for baselines that copy the input
             rows, both = [row for row in rows if row.name == "model"], both[:1]
         for metrics, where in both:
@@ -135,7 +136,10 @@ def _tables(card: ModelCard) -> list[str]:
             lines = []
             for row in rows:
                 cells = [(getattr(row, key), METRICS[key][1]) for key in keys]
-                texts = [cell.text(digits) if cell else "–" for cell, digits in cells]
+                texts = [
+                    figure(cell.mean, cell.interval, digits) if cell else "–"
+                    for cell, digits in cells
+                ]
                 name = "**this model**" if row.name == "model" else row.name.replace("_", " ")
                 lines.append([name, *texts])
             tables.append(markdown([*header, *(METRICS[key][0] for key in keys)], lines))

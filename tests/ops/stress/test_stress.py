@@ -6,6 +6,7 @@ import hypothesis
 import pytest
 import torch
 from helpers import assert_rel_rms
+from ops.stress import model_case as stress_model
 
 from gamba_warp import cli
 from gamba_warp.kernels.cases import conv, raster, scan
@@ -13,7 +14,6 @@ from gamba_warp.kernels.cases.random_case import RandomCase, run_case
 from gamba_warp.kernels.selective_scan import selective_scan_fn, selective_scan_state
 from gamba_warp.kernels.selective_scan.reference import selective_scan_reference
 from gamba_warp.kernels.stress import run as stress
-from gamba_warp.measure import stress as stress_model
 
 CPU = torch.device("cpu")
 OPS = {module.OP.name: module.OP for module in (scan, conv, raster, stress_model)}

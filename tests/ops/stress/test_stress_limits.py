@@ -5,11 +5,11 @@ from pathlib import Path
 
 import pytest
 import torch
+from ops.stress import model_case as model
 
 from gamba_warp.kernels.cases import conv, raster, scan
 from gamba_warp.kernels.cases.random_case import RandomCase, run_case
 from gamba_warp.kernels.rasterize.reference import rasterization_reference
-from gamba_warp.measure import stress as model
 
 CPU = torch.device("cpu")
 OPS = {module.OP.name: module.OP for module in (conv, scan, raster, model)}

@@ -7,16 +7,16 @@ from functools import partial
 import torch
 from torch import Tensor
 
-from ..cameras import Cameras, intrinsics, orbit, plucker_rays
-from ..kernels.cases.random_case import Op, Outcome, RandomCase, Runs, generator
-from ..kernels.cases.rounding import SAMPLES, Rounding, samples_of
-from ..kernels.cases.scan_oracle import EXP_ULPS, conv, scan
-from ..model.config import GambaConfig
-from ..model.gamba import Gamba
-from ..model.parts.block import GambaBlock
-from ..model.parts.decoder import MIN_SCALE
-from ..model.parts.prefix import prefix_states
-from ..model.parts.tokens import normalize_imagenet
+from gamba_warp.cameras import Cameras, intrinsics, orbit, plucker_rays
+from gamba_warp.kernels.cases.random_case import Op, Outcome, RandomCase, Runs, generator
+from gamba_warp.kernels.cases.rounding import SAMPLES, Rounding, samples_of
+from gamba_warp.kernels.cases.scan_oracle import EXP_ULPS, conv, scan
+from gamba_warp.model.config import GambaConfig
+from gamba_warp.model.gamba import Gamba
+from gamba_warp.model.parts.block import GambaBlock
+from gamba_warp.model.parts.decoder import MIN_SCALE
+from gamba_warp.model.parts.prefix import prefix_states
+from gamba_warp.model.parts.tokens import normalize_imagenet
 
 KINDS = (
     "uniform", "white", "black", "checkerboard", "one pixel", "out of range", "tiny weights",
