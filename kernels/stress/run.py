@@ -26,7 +26,7 @@ _HEAD = (
     *("op", "kind", "cases", "forward error", "of", "gradient error", "of", "error / limit"),
     *("undecided pixels", "steep", "non-finite", "failures"),
 )
-_NOTHING = {"error": 0.0, "of": ""}
+_SUMS = "cases", "nonfinite", "failures", "pixels", "undecided", "steep", "seconds"
 
 
 class _Stop(BaseException):
@@ -51,37 +51,16 @@ def cases_of(op: Op) -> st.SearchStrategy[RandomCase]:
     return draw_case()
 
 
-def _row(op: str, kind: str, results: Sequence[tuple[RandomCase, Outcome, float]]) -> dict:
-    """Return a row of results; the kind "all" means all kinds of an op.
+def _row(op: str, kind: str) -> dict:
+    """Return an empty row of results of a kind of cases; "all" means all kinds of an op.
 
     It has the largest relative rms errors of a float32 result and of a gradient with their names;
-    the largest error over its limit, infinite if something was not finite; and sums of values
-    defined by ``Outcome``.
+    the largest error over its limit, infinite if something was not finite; and ``_SUMS``, defined
+    by ``Outcome``.
     """
-    outcomes = [outcome for _, outcome, _ in results]
-    comparisons = [comparison for outcome in outcomes for comparison in outcome.comparisons]
-
-    def worst(of_gradient: bool) -> dict:
-        shown = [
-            c for c in comparisons if c.counts and c.name.startswith("gradient") == of_gradient
-        ]
-        most = max(shown, key=lambda c: c.error, default=None)
-        return {"error": most.error, "of": most.name} if most and most.error else dict(_NOTHING)
-
-    return {
-        "op": op,
-        "kind": kind,
-        "cases": len(results),
-        "nonfinite": sum(o.nonfinite for o in outcomes),
-        "failures": sum(o.failure() is not None for o in outcomes),
-        "pixels": sum(o.pixels for o in outcomes),
-        "undecided": sum(o.undecided for o in outcomes),
-        "steep": sum(o.steep for o in outcomes),
-        "seconds": sum(seconds for _, _, seconds in results),
-        "ratio": max((c.ratio for c in comparisons), default=0.0),
-        "forward": worst(False),
-        "gradient": worst(True),
-    }
+    nothing = {"error": 0.0, "of": ""}
+    sums = dict.fromkeys(_SUMS, 0)
+    return {"op": op, "kind": kind, **sums, "ratio": 0.0, "forward": nothing, "gradient": nothing}
 
 
 def _plain(value: Any) -> Any:
@@ -121,8 +100,7 @@ class StressRun:
         self._ops, self._device = ops, device
         versions = {"gamba_warp": __version__} | installed("torch", "warp-lang")
         self.about = {"seed": seed, "device": str(device), **versions, "interrupted": False}
-        self._results: list[tuple[RandomCase, Outcome, float]] = []
-        self._worst = 0.0  # error over its limit
+        self._rows: dict[tuple[str, str], dict] = {}
         self.failures: list[dict] = []
 
     def run(
@@ -172,16 +150,14 @@ class StressRun:
             started = time.monotonic()
             outcome = run_case(op, case, self._device)
             if not found:
-                self._results.append((case, outcome, time.monotonic() - started))
-                ratio = outcome.worst.ratio if outcome.worst else 0.0
-                self._worst = max(self._worst, ratio)
+                self._count(case, outcome, time.monotonic() - started)
             if failure := outcome.failure():
                 if not found:
                     until = time.monotonic() + _SHRINK
                 found.append((case, outcome))
                 say("shrinking a failing case")
                 raise _FAILURES[failure["what"]]
-            say(f"worst {self._worst:.2f} of its limit")
+            say(f"worst {max(r['ratio'] for r in self._rows.values()):.2f} of its limit")
 
         options = settings(
             max_examples=cases or 10**6,
@@ -202,25 +178,34 @@ class StressRun:
                 text, case = failure_text(*found[-1]), found[-1][0]._asdict()
                 self.failures.append({"text": text, "case": case})
 
-    def _rows(self) -> tuple[list[dict], list[dict]]:
-        """Return one row per op, and the rows of its kinds grouped by op."""
-        totals, rows = [], []
-        for op in dict.fromkeys(case.op for case, *_ in self._results):
-            of_op = [result for result in self._results if result[0].op == op]
-            totals.append(_row(op, "all", of_op))
-            for kind in dict.fromkeys(case.kind for case, *_ in of_op):
-                rows.append(_row(op, kind, [r for r in of_op if r[0].kind == kind]))
-        return totals, rows
+    def _count(self, case: RandomCase, outcome: Outcome, seconds: float) -> None:
+        failed = outcome.failure() is not None
+        found = vars(outcome) | {"cases": 1, "nonfinite": outcome.nonfinite, "failures": failed}
+        for key in ((case.op, "all"), (case.op, case.kind)):
+            row = self._rows.setdefault(key, _row(*key))
+            for name in _SUMS:
+                row[name] += (found | {"seconds": seconds})[name]
+            for c in outcome.comparisons:
+                row["ratio"] = max(row["ratio"], c.ratio)
+                which = "gradient" if c.name.startswith("gradient") else "forward"
+                if c.counts and c.error > row[which]["error"]:
+                    row[which] = {"error": c.error, "of": c.name}
+
+    def _sorted(self) -> tuple[list[dict], list[dict]]:
+        """Return one row per op, and all other rows grouped by op."""
+        totals = [row for row in self._rows.values() if row["kind"] == "all"]
+        rows = [r for t in totals for r in self._rows.values() if r["op"] == t["op"]]
+        return totals, [row for row in rows if row["kind"] != "all"]
 
     def document(self) -> dict:
         """Return all results, ready for JSON."""
-        totals, rows = self._rows()
+        totals, rows = self._sorted()
         lists = {"totals": [*map(_plain, totals)], "rows": [*map(_plain, rows)]}
         return self.about | lists | {"failures": self.failures}
 
     def markdown(self) -> str:
         """Return all results as a page."""
-        totals, rows = self._rows()
+        totals, rows = self._sorted()
         about = ", ".join(f"{name} {value}" for name, value in self.about.items())
         parts = ["# Numerical stress test", about, _table(totals), _table(rows)]
         if self.failures:
@@ -229,7 +214,7 @@ class StressRun:
 
     def summary(self) -> str:
         """Return the table of the cases, and a line for each failure."""
-        totals, rows = self._rows()
+        totals, rows = self._sorted()
         lines = [_table([*rows, *totals]), *(f["text"] for f in self.failures)]
         cases = sum(row["cases"] for row in totals)
         return "\n".join([*lines, f"{cases} cases, {len(self.failures)} failed"])
