@@ -227,7 +227,7 @@ class ObjectFiles:
             ends = [end for end in self.suffixes(meshes) if end != ".html"]
             section.files = [section.title + end for end in ends]
             title = section.title
-            write_page(self.options.out / f"{title}.html", title, [section], auto=True)
+            write_page(self.options.out / f"{title}.html", title, [section])
 
 
 @dataclass(kw_only=True)

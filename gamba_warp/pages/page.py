@@ -18,7 +18,7 @@ from ..gaussians import Gaussians
 from ..images import to_uint8
 from ..trajectories.movies import SECONDS
 from ..trajectories.paths import Viewpoint
-from ..viewer.page import POLICY, frame_element, frames_script
+from ..viewer.page import POLICY, viewer_page
 from .templates import render
 
 
@@ -55,9 +55,7 @@ class Section:
     view: Viewpoint = Viewpoint()
 
 
-def write_page(
-    path: str | Path, title: str, sections: Sequence[Section], text: str = "", auto: bool = False
-) -> None:
+def write_page(path: str | Path, title: str, sections: Sequence[Section], text: str = "") -> None:
     """Write a whole page, atomically.
 
     Args:
@@ -65,17 +63,14 @@ def write_page(
         title: heading of the page.
         sections: in order.
         text: below the heading; an empty line separates paragraphs.
-        auto: viewers are large and start by themselves, and sections have no headings.
 
     Raises:
         UserError: the file cannot be written.
     """
-    viewers = any(section.gaussians is not None for section in sections)
     page = render(
         "page.html",
-        **{"title": title, "text": text, "sections": sections, "auto": auto, "policy": POLICY},
+        **{"title": title, "text": text, "sections": sections, "policy": POLICY},
         style=Markup((Path(__file__).parent / "page.css").read_text(encoding="utf-8")),
-        script=Markup(frames_script() if viewers else ""),
         **{"image": _image, "animation": _animation, "viewer": _viewer},
         paragraphs=lambda text: filter(None, text.split("\n\n")),
     )
@@ -107,17 +102,16 @@ def _element(content: io.BytesIO, kind: str, label: str, css: str = "") -> str:
     return Markup('<img{} alt="{}" src="{}">').format(shown, label, data)
 
 
-def _viewer(section: Section, number: int, poster: str, auto: bool) -> str:
-    assert section.gaussians is not None
-    which = "view" if section.image is None else "camera"  # the camera of the image
-    element = frame_element(
-        f"viewer{number}",
+def _viewer(section: Section) -> str:
+    """Return a frame with the viewer."""
+    camera, of_image = section.view.camera, section.image is not None
+    document = viewer_page(
         section.title,
         section.gaussians,
         mesh=section.mesh,
         image=section.image,
-        poster=poster,
-        auto=auto,
-        **{which: section.view.camera},
+        camera=camera if of_image else None,
+        view=None if of_image else camera,
     )
-    return Markup(element)
+    frame = '<iframe class="viewer" title="3D view" allow="fullscreen *" srcdoc="{}"></iframe>'
+    return Markup(frame).format(document)

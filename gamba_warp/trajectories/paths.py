@@ -32,7 +32,7 @@ class Viewpoint:
 
     @property
     def camera(self) -> tuple[float, float, float]:
-        """Distance, field of view and elevation, in the order of ``viewer.page.viewer_parts``."""
+        """Distance, field of view and elevation, in the order of ``viewer.page.viewer_page``."""
         return self.distance, self.fov, self.elevation
 
     def changed(

@@ -10,7 +10,7 @@ import math
 import re
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from PIL import Image
@@ -31,56 +31,7 @@ POLICY = (
 )
 
 
-class ViewerParts(NamedTuple):
-    """Object-specific parts of a viewer, as texts for HTML.
-
-    Attributes:
-        object: JSON about the object and its cameras.
-        gaussians: the records of ``pack_gaussians``, base64.
-        harmonics: the coefficients, base64, or nothing.
-        mesh: ``pack_mesh``, base64, or nothing.
-    """
-
-    object: str
-    gaussians: str
-    harmonics: str
-    mesh: str
-
-
-def viewer_page(title: str, gaussians: Gaussians | None, **options: Any) -> str:
-    """Return the viewer of one object as a document, for a file or the ``srcdoc`` of a frame.
-
-    Arguments and errors are those of ``viewer_parts``.
-    """
-    parts = viewer_parts(title, gaussians, **options)
-    return _filled(program_page(title), parts._asdict())
-
-
-def write_viewer(path: str | Path, title: str, gaussians: Gaussians | None, **options: Any) -> None:
-    """Write ``viewer_page`` to a file, atomically; arguments and errors as there.
-
-    Raises:
-        UserError: also if the file cannot be written.
-    """
-    write_text(path, viewer_page(title, gaussians, **options))
-
-
-def program_page(title: str = "") -> str:
-    """Return the document without an object, with slots such as ``{{object}}``."""
-    texts = {
-        "policy": POLICY,
-        "title": html.escape(title),
-        "style": _program("viewer.css"),
-        "script": "".join(_program(f"{name}.js") for name in _SCRIPTS),
-    }
-    return _filled(_program("viewer.html"), texts)
-
-
-def _program(name: str) -> str:
-    return (Path(__file__).parent / "program" / name).read_text(encoding="utf-8")
-
-
-def viewer_parts(
+def viewer_page(
     title: str,
     gaussians: Gaussians | None,
     *,
@@ -90,8 +41,8 @@ def viewer_parts(
     image: np.ndarray | None = None,
     note: str = "",
     edit: dict[str, Any] | None = None,
-) -> ViewerParts:
-    """Return the texts for the slots of ``program_page``.
+) -> str:
+    """Return the viewer of one object as a document, for a file or the ``srcdoc`` of a frame.
 
     Args:
         title: name of the object.
@@ -138,8 +89,29 @@ def viewer_parts(
         "frame": {"center": frame.center.tolist(), "size": frame.size},
         "edit": edit,
     }
-    packed = (base64.b64encode(part).decode() for part in (records, harmonics, surface))
-    return ViewerParts(json_text(about), *packed)
+    texts = {
+        "policy": POLICY,
+        "title": html.escape(title),
+        "style": _program("viewer.css"),
+        "script": "".join(_program(f"{name}.js") for name in _SCRIPTS),
+        "object": json_text(about),
+    }
+    for name, part in (("gaussians", records), ("harmonics", harmonics), ("mesh", surface)):
+        texts[name] = base64.b64encode(part).decode()
+    return _filled(_program("viewer.html"), texts)
+
+
+def write_viewer(path: str | Path, title: str, gaussians: Gaussians | None, **options: Any) -> None:
+    """Write ``viewer_page`` to a file, atomically; arguments and errors as there.
+
+    Raises:
+        UserError: also if the file cannot be written.
+    """
+    write_text(path, viewer_page(title, gaussians, **options))
+
+
+def _program(name: str) -> str:
+    return (Path(__file__).parent / "program" / name).read_text(encoding="utf-8")
 
 
 def _data_url(image: np.ndarray) -> str:
@@ -147,48 +119,6 @@ def _data_url(image: np.ndarray) -> str:
     small.thumbnail((_IMAGE, _IMAGE))
     small.save(content, "WEBP", quality=90)
     return f"data:image/webp;base64,{base64.b64encode(content.getvalue()).decode()}"
-
-
-def frame_element(
-    name: str,
-    title: str,
-    gaussians: Gaussians,
-    *,
-    poster: str = "",
-    auto: bool = False,
-    **options: Any,
-) -> str:
-    """Return an element of another page in which the viewer runs, in its own frame.
-
-    The page also needs ``frames_script()``, once, and ``POLICY`` or a wider policy.
-
-    Args:
-        name: unique id of the element: letters and digits.
-        title: as for ``viewer_parts``, like ``gaussians``.
-        poster: HTML shown until the viewer starts.
-        auto: start without a click.
-        options: as for ``viewer_parts``; errors as there.
-    """
-    parts = viewer_parts(title, gaussians, **options)
-    kinds = {"object": "application/json"}
-    scripts = "".join(
-        f'<script type="{kinds.get(part, "text/plain")}" id="{name}-{part}">{text}</script>'
-        for part, text in parts._asdict().items()
-    )
-    start = " data-auto" if auto else ""
-    return (
-        f'<div class="viewer" data-viewer="{name}"{start}>{poster}'
-        f'<button type="button">3D</button></div>{scripts}'
-    )
-
-
-def frames_script() -> str:
-    """Return the script that starts the viewers of a page, with the program."""
-    script, program = _program("frames.js"), json_text(program_page())
-    return (
-        f'<script type="application/json" id="viewer-program">{program}</script>\n'
-        f"<script>\n{script}</script>\n"
-    )
 
 
 def json_text(value: Any) -> str:

@@ -49,37 +49,12 @@ def frames(opened, count):
     return found
 
 
-def test_viewers_of_a_page_start_when_asked(browser_page, tmp_path):
-    turn = np.zeros((2, 8, 8, 3), np.uint8)
-    sections = [Section(f"Chair {i}", gaussians=some(40), turntable=turn) for i in range(2)]
-    write_page(tmp_path / "a.html", "", sections)
-    opened = browser_page(tmp_path / "a.html", 800, 600)
-    assert not opened.page.query_selector("iframe")
-    for button in opened.page.query_selector_all(".viewer button"):
-        button.click()
-    both = frames(opened, 2)
-    assert [frame.evaluate("gambaViewer.about.title") for frame in both] == ["Chair 0", "Chair 1"]
-    assert all(shown(frame) > 100 for frame in both) and not opened.messages
-    assert not any(frame.evaluate("gambaViewer.about.input") for frame in both)
-
-
-def test_the_first_of_many_viewers_goes_back_to_its_image(browser_page, tmp_path):
-    sections = [Section(f"Chair {i}", gaussians=some(5)) for i in range(7)]
-    write_page(tmp_path / "a.html", "", sections)
-    opened = browser_page(tmp_path / "a.html", 800, 600)
-    opened.page.evaluate("document.querySelectorAll('.viewer button').forEach((b) => b.click())")
-    found = opened.page.evaluate(
-        "[...document.querySelectorAll('.viewer')].map((v) => v.children.length)"
-    )
-    assert found == [1, 2, 2, 2, 2, 2, 2] and not opened.messages
-
-
 def test_the_viewer_of_a_reconstruction_starts_by_itself(browser_page, tmp_path):
     vertices = 0.4 * torch.eye(3).numpy()
     mesh = Surface(vertices, np.array([[0, 1, 2]]), None)
     image = np.ones((9, 9, 4), np.float32)
     section = Section("A chair", gaussians=some(40), image=image, mesh=mesh, view=Viewpoint(20.0))
-    write_page(tmp_path / "a.html", section.title, [section], auto=True)
+    write_page(tmp_path / "a.html", section.title, [section])
     opened = browser_page(tmp_path / "a.html", 800, 600)
     (frame,) = frames(opened, 1)
     assert shown(frame) > 100
