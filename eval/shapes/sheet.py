@@ -102,7 +102,7 @@ def save_sheet(
     sheet = Image.new("L", (4 * SIDE, _LABEL + high * len(chosen)), 255)
     draw, font = ImageDraw.Draw(sheet), ImageFont.load_default(12)
     draw.text((4, 3), "prediction", 0, font)
-    draw.text((2 * SIDE + 4, 3), "truth", 0, font)
+    draw.text((2 * SIDE + 4, 3), "ground truth", 0, font)
     for number, record in enumerate(chosen):
         top = _LABEL + number * high
         iou = "" if record["iou"] is None else f", Volume IoU {record['iou']:.3f}"

@@ -80,7 +80,7 @@ def _call(words: list[str]) -> int:
 
 def _evaluate(model: Path, starter: Path, out: Path, lpips: str) -> None:
     """Run a model on images and objects outside its training set."""
-    views, gt, data = out / "views", output_folder(out / "truth"), starter / "data"
+    views, gt, data = out / "views", output_folder(out / "gt"), starter / "data"
     _gamba(
         *("reconstruct", starter / "icons", "--checkpoint", model, "--out", out / "icons"),
         *("--turntable", "none", "--sheet", out / SHEET),
