@@ -68,7 +68,7 @@ def sequences(
     if given.dtype not in _DTYPES:
         raise TypeError(f"{name} must have dtype {', '.join(map(str, _DTYPES))}, got {given.dtype}")
     if given.device != x.device:
-        raise ValueError(f"{name} is on {given.device}, the tokens are on {x.device}")
+        raise ValueError(f"{name} must be on {x.device}, as the tokens, got {given.device}")
     if cu_seqlens is None:
         if tuple(given.shape) != (batch, length):
             raise ValueError(f"seq_idx must have shape {(batch, length)}, got {tuple(given.shape)}")

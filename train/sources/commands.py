@@ -39,8 +39,8 @@ class Selection:
     """Selection of objects for a command.
 
     Attributes:
-        shard: i/n takes every n-th object from the i-th, for n machines.
-        limit: stop after this many objects.
+        shard: Take every n-th object from the i-th, i/n, for n machines.
+        limit: Stop after this many objects.
     """
 
     shard: str = "0/1"
@@ -135,8 +135,8 @@ def data_render_command(
     Args:
         folder: folder of meshes, at any depth; its catalogue.json may give names and attribution.
         out: the dataset to make or to continue.
-        settings: options of the images.
-        selection: of objects.
+        settings: Options of the images.
+        selection: Selection of objects.
         split: render only the objects of this part of the set.
         workers: number of processes; 0 means one per core.
     """
@@ -234,7 +234,7 @@ def data_gso_command(
     Args:
         out: folder to make or to continue.
         source: folder of the set, with a folder or a zip of each model as the Fuel server has them.
-        selection: of objects.
+        selection: Selection of objects.
         size: pixels a side; the evaluation's are 512.
         objects: text file of other objects, one name a line: the same poses, another list.
         workers: number of processes that render; 0 means one per core.

@@ -237,7 +237,7 @@ def test_bad_states_and_devices():
         ValueError, match=r"initial_state must have shape \(2, 3, 5\).*, got \(1, 3, 5\)"
     ):
         causal_conv1d(**conv_inputs(1, 7, 5, 4), cu_seqlens=cuts)
-    with pytest.raises(ValueError, match="cu_seqlens is on meta, the tokens are on cpu"):
+    with pytest.raises(ValueError, match="cu_seqlens must be on cpu, as the tokens, got meta"):
         selective_scan(**make(1, 7, 5, 3), cu_seqlens=cuts.to("meta"))
     with pytest.raises(ValueError, match="got \(3,\) with 2"):
         selective_scan(**make(2, 7, 5, 3), cu_seqlens=cuts)
