@@ -53,7 +53,6 @@ def read_xyz(source: Source) -> Cloud:
         UserError: the file has over ``MAX_POINTS`` points or none, a word is not a number, the
             rows differ in length, or a point is not finite.
     """
-    source.check()
     path = source.path
     table = read_rows(source.file.read(), str(path), comments=True).table(str(path))
     if len(table) and table.shape[1] < 3:
