@@ -121,6 +121,12 @@ def viewer_parts(
     distance, fov, elevation = camera or view or (DEFAULT_DISTANCE, DEFAULT_FOV, 0.0)
     home = {"azimuth": 0.0, "elevation": math.radians(elevation), "distance": distance}
     home |= {"target": [0.0, 0.0, 0.0], "fov": fov}
+    url = ""
+    if image is not None:
+        content, small = io.BytesIO(), Image.fromarray(to_uint8(image))
+        small.thumbnail((_IMAGE, _IMAGE))
+        small.save(content, "WEBP", quality=90)
+        url = f"data:image/webp;base64,{base64.b64encode(content.getvalue()).decode()}"
     records, harmonics = (b"", b"") if seen is None else pack_gaussians(seen, frame)
     surface, vertices, faces = (b"", 0, 0) if mesh is None else pack_mesh(mesh, frame, title)
     about = {
@@ -134,19 +140,12 @@ def viewer_parts(
         "faces": faces,
         "home": home,
         "input": None if camera is None else home,
-        "image": "" if image is None else _data_url(image),
+        "image": url,
         "frame": {"center": frame.center.tolist(), "size": frame.size},
         "edit": edit,
     }
     packed = (base64.b64encode(part).decode() for part in (records, harmonics, surface))
     return ViewerParts(json_text(about), *packed)
-
-
-def _data_url(image: np.ndarray) -> str:
-    content, small = io.BytesIO(), Image.fromarray(to_uint8(image))
-    small.thumbnail((_IMAGE, _IMAGE))
-    small.save(content, "WEBP", quality=90)
-    return f"data:image/webp;base64,{base64.b64encode(content.getvalue()).decode()}"
 
 
 def frame_element(
