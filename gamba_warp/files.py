@@ -188,7 +188,10 @@ def sweep(folder: str | Path, age: float = _DAY) -> None:
         try:
             if entry.stat(follow_symlinks=False).st_uid != os.geteuid() or entry.is_symlink():
                 continue
-            if time.time() - _last_written(entry) < age:
+            # The last write to a file, or to a folder and its direct entries.
+            inner = os.scandir(entry.path) if entry.is_dir(follow_symlinks=False) else ()
+            last = max(e.stat(follow_symlinks=False).st_mtime for e in (entry, *inner))
+            if time.time() - last < age:
                 continue
             if entry.is_dir():
                 shutil.rmtree(entry.path, ignore_errors=True)
@@ -196,12 +199,6 @@ def sweep(folder: str | Path, age: float = _DAY) -> None:
                 os.unlink(entry.path)
         except OSError:  # removed meanwhile
             continue
-
-
-def _last_written(entry: os.DirEntry) -> float:
-    """Return the last write to a file, or to a folder and its direct entries, in Unix seconds."""
-    inner = os.scandir(entry.path) if entry.is_dir(follow_symlinks=False) else ()
-    return max(e.stat(follow_symlinks=False).st_mtime for e in (entry, *inner))
 
 
 def walk(root: str | Path) -> Iterator[tuple[str, list[str], list[str]]]:
@@ -266,18 +263,14 @@ def other_kinds(files: Iterable[Path], known: Container[str]) -> str:
     return f"{len(others)} file{'s' * (len(others) > 1)} of other kinds ({shown})"
 
 
-def plain_file(path: str | Path, links: bool = True) -> os.stat_result:
-    """Return the status of a plain file.
-
-    Args:
-        path: of the file.
-        links: follow symbolic links; else a link is refused.
+def plain_file(path: str | Path) -> os.stat_result:
+    """Return the status of a plain file, at the end of links.
 
     Raises:
         UserError: it is missing or another kind of file.
     """
     try:
-        found = os.stat(path, follow_symlinks=links)
+        found = os.stat(path)
     except OSError as error:
         raise UserError(f"{path}: {error.strerror or error}") from error
     if not stat.S_ISREG(found.st_mode):
@@ -389,8 +382,7 @@ def sha256(path: str | Path) -> str:
         UserError: the file cannot be read, or is not a plain file.
     """
     digest = hashlib.sha256()
-    if Path(path).exists() and not Path(path).is_file():  # a pipe or a device has no end
-        raise UserError(f"{path}: not a plain file")
+    plain_file(path)  # a pipe or a device has no end
     try:
         with open(path, "rb") as file:
             while part := file.read(_READ):
