@@ -19,7 +19,6 @@ from .headers import MAX_VALUES, Source, read_rows
 from .ply_data import PlyData
 
 MAX_POINTS = MAX_VALUES // 3
-_AXES = ("x", "y", "z")
 
 
 class Cloud(NamedTuple):
@@ -62,7 +61,7 @@ def read_xyz(source: Source) -> Cloud:
 
 def cloud_of(path: Path, data: PlyData) -> Cloud:
     """Return the cloud of a ``.ply`` file's content. Raises UserError as ``read_xyz``."""
-    positions = data.numbers("vertex", _AXES)
+    positions = data.numbers("x", "y", "z")
     if positions is None:
         raise UserError(f"{path}: its vertices have no x, y and z")
-    return _checked(path, positions, data.numbers("vertex", ("nx", "ny", "nz")))
+    return _checked(path, positions, data.numbers("nx", "ny", "nz"))

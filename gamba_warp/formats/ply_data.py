@@ -92,9 +92,9 @@ class PlyData(NamedTuple):
     header: PlyHeader
     elements: dict[str, Columns]
 
-    def numbers(self, element: str, names: tuple[str, ...]) -> np.ndarray | None:
-        """Return properties of an element, ``[N, C]`` float64; None if one is missing."""
-        found = [self.elements.get(element, {}).get(name) for name in names]
+    def numbers(self, *names: str) -> np.ndarray | None:
+        """Return properties of the vertices, ``[N, C]`` float64; None if one is missing."""
+        found = [self.elements.get("vertex", {}).get(name) for name in names]
         if not all(isinstance(column, np.ndarray) for column in found):
             return None
         return np.stack([np.asarray(column, np.float64) for column in found], 1)

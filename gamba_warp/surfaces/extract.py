@@ -11,6 +11,7 @@ from torch import Tensor
 from ..batch import STAGES
 from ..errors import UserError
 from ..gaussians import Gaussians
+from ..untrusted.ranges import check_options
 from .density import level_set
 from .options import SurfaceOptions
 from .solid import distances, solid_of
@@ -63,7 +64,7 @@ def extract_surface(gaussians: Gaussians, options: SurfaceOptions, texture: int 
     """
     if options.method not in ("tsdf", "density"):
         raise ValueError(f"method is {options.method!r}, which has no surface")
-    options.check()
+    check_options(options)
     gaussians = near_and_visible(gaussians.detach())
     views = None
     STAGES.begin("mesh views")
