@@ -201,6 +201,15 @@ def sweep(folder: str | Path, age: float = _DAY) -> None:
             continue
 
 
+def identity(path: str | Path) -> tuple[int, int] | None:
+    """Return the device and inode of a file or folder, links followed; None if it is missing."""
+    try:
+        found = os.stat(path)
+    except (OSError, ValueError):
+        return None
+    return found.st_dev, found.st_ino
+
+
 def walk(root: str | Path) -> Iterator[tuple[str, list[str], list[str]]]:
     """Yield like ``os.walk``, also into linked folders, without names that begin with a dot.
 
@@ -208,14 +217,6 @@ def walk(root: str | Path) -> Iterator[tuple[str, list[str], list[str]]]:
     parent of ``root`` is skipped. The caller may remove subfolders from the list, which are then
     not entered. Both lists are sorted.
     """
-
-    def identity(folder: str | Path) -> tuple[int, int] | None:
-        try:
-            status = os.stat(folder)
-        except OSError:  # removed meanwhile
-            return None
-        return status.st_dev, status.st_ino
-
     seen = {None, *map(identity, Path(os.path.realpath(root)).parents)}
     waiting = [os.fspath(root)]
     for start in waiting:  # grows by the links that are found

@@ -10,7 +10,7 @@ import math
 import re
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from PIL import Image
@@ -31,29 +31,12 @@ POLICY = (
 )
 
 
-class ViewerParts(NamedTuple):
-    """Object-specific parts of a viewer, as texts for HTML.
-
-    Attributes:
-        object: JSON about the object and its cameras.
-        gaussians: the records of ``pack_gaussians``, base64.
-        harmonics: the coefficients, base64, or nothing.
-        mesh: ``pack_mesh``, base64, or nothing.
-    """
-
-    object: str
-    gaussians: str
-    harmonics: str
-    mesh: str
-
-
 def viewer_page(title: str, gaussians: Gaussians | None, **options: Any) -> str:
     """Return the viewer of one object as a document, for a file or the ``srcdoc`` of a frame.
 
     Arguments and errors are those of ``viewer_parts``.
     """
-    parts = viewer_parts(title, gaussians, **options)
-    return _filled(program_page(title), parts._asdict())
+    return _filled(program_page(title), viewer_parts(title, gaussians, **options))
 
 
 def write_viewer(path: str | Path, title: str, gaussians: Gaussians | None, **options: Any) -> None:
@@ -90,8 +73,12 @@ def viewer_parts(
     image: np.ndarray | None = None,
     note: str = "",
     edit: dict[str, Any] | None = None,
-) -> ViewerParts:
+) -> dict[str, str]:
     """Return the texts for the slots of ``program_page``.
+
+    They are ``object``, JSON about the object and its cameras, and in base64 ``gaussians`` (the
+    records of ``pack_gaussians``), ``harmonics`` (their coefficients, or nothing) and ``mesh`` (of
+    ``pack_mesh``, or nothing).
 
     Args:
         title: name of the object.
@@ -144,8 +131,9 @@ def viewer_parts(
         "frame": {"center": frame.center.tolist(), "size": frame.size},
         "edit": edit,
     }
-    packed = (base64.b64encode(part).decode() for part in (records, harmonics, surface))
-    return ViewerParts(json_text(about), *packed)
+    packed = {"gaussians": records, "harmonics": harmonics, "mesh": surface}
+    texts = {name: base64.b64encode(part).decode() for name, part in packed.items()}
+    return {"object": json_text(about), **texts}
 
 
 def frame_element(
@@ -172,7 +160,7 @@ def frame_element(
     kinds = {"object": "application/json"}
     scripts = "".join(
         f'<script type="{kinds.get(part, "text/plain")}" id="{name}-{part}">{text}</script>'
-        for part, text in parts._asdict().items()
+        for part, text in parts.items()
     )
     start = " data-auto" if auto else ""
     return (

@@ -46,18 +46,13 @@ class Selection:
     shard: str = "0/1"
     limit: Annotated[int, Meta(ge=1, le=10**9)] | None = None
 
-    @property
-    def numbers(self) -> tuple[int, int]:
-        """Numbers i and n of the shard.
+    def of(self, items: Sequence[Item]) -> Sequence[Item]:
+        """Select from the items.
 
         Raises:
             UserError: the shard is not of the form i/n with 0 <= i < n.
         """
-        return shard_numbers(self.shard)
-
-    def of(self, items: Sequence[Item]) -> Sequence[Item]:
-        """Select from the items."""
-        first, count = self.numbers
+        first, count = shard_numbers(self.shard)
         return items[first::count][: self.limit]
 
 
