@@ -38,15 +38,7 @@ from .layouts import (
     find_objects,
     one_line,
 )
-from .manifest import (
-    MANIFEST,
-    Entry,
-    Manifest,
-    list_of,
-    marks_of,
-    read_manifest,
-    write_manifest,
-)
+from .manifest import MANIFEST, Entry, Manifest, list_of, marks_of, read_manifest, write_manifest
 
 SPLITS = ("train", "val", "test")
 SPLIT_VERSION = 2  # of written files; version 1 had fewer objects in one group
