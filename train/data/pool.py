@@ -1,4 +1,4 @@
-"""Made objects for training: other processes make and render them while the model trains.
+"""Procedural objects for training: other processes make and render them while the model trains.
 
 The pool has ``SLOTS`` slots. A round takes one sample from each slot, in its own order, and an
 object stays in its slot for ``USES`` rounds. The slots change their objects at staggered rounds, so
@@ -51,7 +51,7 @@ class PoolOptions:
 
 
 class Pool:
-    """Made objects by sample number; threads may take them in roughly that order."""
+    """Procedural objects by sample number; threads may take them in roughly that order."""
 
     def __init__(self, options: PoolOptions, first: int) -> None:
         """Start making the objects of the samples from ``first`` on.

@@ -1,4 +1,4 @@
-"""Commands ``gamba data furniture``, ``made``, ``render`` and the others.
+"""Commands ``gamba data furniture``, ``procedural``, ``render`` and the others.
 
 They parse, call and print. Existing results are skipped, so a stopped command can be continued.
 Failures are printed to stderr, and the exit code is then 1.
