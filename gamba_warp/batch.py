@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, TextIO, TypeVar
 from unicodedata import normalize
 
 from .errors import UserError, escaped, first_line, one_line
-from .files import check_folder_name
+from .files import check_folder_name, identity
 
 if TYPE_CHECKING:
     from tqdm import tqdm
@@ -235,24 +235,15 @@ def check_not_read(targets: Iterable[Path], reads: Iterable[Path | None]) -> Non
     files: dict[tuple[int, int], Path] = {}
     folders: dict[tuple[int, int], Path] = {}
     for path in reads:
-        if path is not None and (found := _identity(path)) is not None:
+        if path is not None and (found := identity(path)) is not None:
             (folders if path.is_dir() else files)[found] = path
     for target in targets:
-        there = _identity(target)
+        there = identity(target)
         if there is None:
             continue
         source = files.get(there)
         if source is None and folders:
-            above = (_identity(parent) for parent in Path(os.path.realpath(target)).parents)
+            above = (identity(parent) for parent in Path(os.path.realpath(target)).parents)
             source = next((target for found in above if found in folders), None)
         if source is not None:
             raise UserError(f"{source}: would be overwritten by an output; give another --out")
-
-
-def _identity(path: Path) -> tuple[int, int] | None:
-    """Return the device and inode of a file, links followed; None if it is missing."""
-    try:
-        found = os.stat(path)
-    except (OSError, ValueError):
-        return None
-    return found.st_dev, found.st_ino

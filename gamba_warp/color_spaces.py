@@ -67,11 +67,6 @@ class Space(NamedTuple):
         off = np.abs(np.subtract(self.primaries, SRGB.primaries)).max()
         return self.curve is to_linear and bool(off < 0.01)
 
-    def to_srgb(self) -> np.ndarray:
-        """Return ``[3, 3]`` from its linear light to that of sRGB; white stays white."""
-        matrix = np.linalg.inv(_to_xyz(SRGB.primaries)) @ _to_xyz(self.primaries)
-        return matrix / matrix.sum(1, keepdims=True)
-
 
 def _to_xyz(primaries: tuple[float, ...]) -> np.ndarray:
     """Return ``[3, 3]`` from linear light to CIE XYZ, with a white of Y = 1."""
@@ -109,24 +104,20 @@ def conversion(image: Image.Image, warn: Callable[[str], None]) -> Convert | Non
     Returns:
         The conversion; None if none is needed or possible.
     """
-    profile = image.info.get("icc_profile")
+    profile, what = image.info.get("icc_profile"), "space"
     try:
         if (points := _code_points(image)) is not None:
             return _from_points(*points)
         if profile is None:
             return _from_space(_stated_space(image))
-    except Exception as error:  # invalid numbers, of which files may hold any
-        warn(f"its colour space is not used ({first_line(error)}); colours are taken as sRGB")
-        return None
-    try:
+        what = "profile"
         if not isinstance(profile, bytes) or not 0 < len(profile) <= _MAX_PROFILE:
             raise ValueError("it is damaged or too large")
         grey = image.mode in ("1", "L", "LA") or image.mode.startswith(("I", "F"))
         mode = "L" if grey else "CMYK" if image.mode == "CMYK" else "RGB"
         return _from_profile(profile, mode)
-    except Exception as error:  # littleCMS is missing, or raises errors of many types
-        reason = first_line(error)
-        warn(f"its colour profile is not used ({reason}); colours are taken as sRGB")
+    except Exception as error:  # invalid numbers, or littleCMS is missing or fails
+        warn(f"its colour {what} is not used ({first_line(error)}); colours are taken as sRGB")
         return None
 
 
@@ -181,12 +172,12 @@ def _stated_space(image: Image.Image) -> Space:
 
 def _from_space(space: Space) -> Convert | None:
     """Return the conversion of RGB or grey pixels; None for sRGB up to rounding."""
-    if (
-        space.curve is to_linear
-        and np.abs(np.subtract(space.primaries, SRGB.primaries)).max() < 0.01
-    ):
+    if space.is_srgb():
         return None
-    matrix, table = space.to_srgb(), space.curve(np.arange(256) / 255.0)
+    # From its linear light to that of sRGB; white stays white.
+    matrix = np.linalg.inv(_to_xyz(SRGB.primaries)) @ _to_xyz(space.primaries)
+    matrix /= matrix.sum(1, keepdims=True)
+    table = space.curve(np.arange(256) / 255.0)
     if not (np.isfinite(matrix).all() and np.isfinite(table).all()):
         raise ValueError("invalid numbers")
 

@@ -188,7 +188,10 @@ def sweep(folder: str | Path, age: float = _DAY) -> None:
         try:
             if entry.stat(follow_symlinks=False).st_uid != os.geteuid() or entry.is_symlink():
                 continue
-            if time.time() - _last_written(entry) < age:
+            # The last write to a file, or to a folder and its direct entries.
+            inner = os.scandir(entry.path) if entry.is_dir(follow_symlinks=False) else ()
+            last = max(e.stat(follow_symlinks=False).st_mtime for e in (entry, *inner))
+            if time.time() - last < age:
                 continue
             if entry.is_dir():
                 shutil.rmtree(entry.path, ignore_errors=True)
@@ -198,10 +201,13 @@ def sweep(folder: str | Path, age: float = _DAY) -> None:
             continue
 
 
-def _last_written(entry: os.DirEntry) -> float:
-    """Return the last write to a file, or to a folder and its direct entries, in Unix seconds."""
-    inner = os.scandir(entry.path) if entry.is_dir(follow_symlinks=False) else ()
-    return max(e.stat(follow_symlinks=False).st_mtime for e in (entry, *inner))
+def identity(path: str | Path) -> tuple[int, int] | None:
+    """Return the device and inode of a file or folder, links followed; None if it is missing."""
+    try:
+        found = os.stat(path)
+    except (OSError, ValueError):
+        return None
+    return found.st_dev, found.st_ino
 
 
 def walk(root: str | Path) -> Iterator[tuple[str, list[str], list[str]]]:
@@ -211,14 +217,6 @@ def walk(root: str | Path) -> Iterator[tuple[str, list[str], list[str]]]:
     parent of ``root`` is skipped. The caller may remove subfolders from the list, which are then
     not entered. Both lists are sorted.
     """
-
-    def identity(folder: str | Path) -> tuple[int, int] | None:
-        try:
-            status = os.stat(folder)
-        except OSError:  # removed meanwhile
-            return None
-        return status.st_dev, status.st_ino
-
     seen = {None, *map(identity, Path(os.path.realpath(root)).parents)}
     waiting = [os.fspath(root)]
     for start in waiting:  # grows by the links that are found
@@ -266,18 +264,14 @@ def other_kinds(files: Iterable[Path], known: Container[str]) -> str:
     return f"{len(others)} file{'s' * (len(others) > 1)} of other kinds ({shown})"
 
 
-def plain_file(path: str | Path, links: bool = True) -> os.stat_result:
-    """Return the status of a plain file.
-
-    Args:
-        path: of the file.
-        links: follow symbolic links; else a link is refused.
+def plain_file(path: str | Path) -> os.stat_result:
+    """Return the status of a plain file, at the end of links.
 
     Raises:
         UserError: it is missing or another kind of file.
     """
     try:
-        found = os.stat(path, follow_symlinks=links)
+        found = os.stat(path)
     except OSError as error:
         raise UserError(f"{path}: {error.strerror or error}") from error
     if not stat.S_ISREG(found.st_mode):
@@ -389,8 +383,7 @@ def sha256(path: str | Path) -> str:
         UserError: the file cannot be read, or is not a plain file.
     """
     digest = hashlib.sha256()
-    if Path(path).exists() and not Path(path).is_file():  # a pipe or a device has no end
-        raise UserError(f"{path}: not a plain file")
+    plain_file(path)  # a pipe or a device has no end
     try:
         with open(path, "rb") as file:
             while part := file.read(_READ):

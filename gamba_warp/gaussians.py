@@ -79,6 +79,11 @@ class Gaussians:
         """Return the Gaussians of one object (no batch dimension) that ``keep [N]`` selects."""
         return self.map(lambda value: value[keep])
 
+    def is_finite(self) -> Tensor:
+        """Return a mask ``[N]`` of the Gaussians of one object that have only finite numbers."""
+        values = self.tensors().values()
+        return torch.stack([x.reshape(len(x), -1).isfinite().all(1) for x in values]).all(0)
+
     def is_drawn(self, least: float | None = None) -> Tensor:
         """Return a mask ``[N]`` of the Gaussians of one object that ``drawn`` keeps."""
         return ~(self.opacities < (ALPHA_MIN if least is None else least))

@@ -361,9 +361,7 @@ def _pixels(
         if grey:
             values = np.clip(np.nan_to_num(np.asarray(band, dtype=np.float32)) / top, 0.0, 1.0)
             if convert is None:
-                part[..., :3] = (
-                    values[..., None] if dtype == np.float32 else to_uint8(values)[..., None]
-                )
+                part[..., :3] = (values if dtype == np.float32 else to_uint8(values))[..., None]
                 part[..., 3] = 1.0 if dtype == np.float32 else 255
                 continue
             band = Image.fromarray(to_uint8(values))
@@ -419,10 +417,11 @@ def find_images(
             paths[path] = None
             continue
         try:
-            inside = sorted(p for p in _inside(path, recursive)[0] if _is_image(p))
+            files = _inside(path, recursive)[0]
         except OSError as error:
             failures.append((path, error.strerror))
             continue
+        inside = sorted(p for p in files if p.suffix.lower() in IMAGE_SUFFIXES)
         paths.update(dict.fromkeys(inside))
         if not inside:
             more = left_out(path, recursive)
@@ -442,10 +441,6 @@ def left_out(path: Path, recursive: bool = False) -> str:
         hint = "; --recursive takes the folders"
     said = ", ".join(filter(None, counts))
     return f"{said} skipped{hint}" if said else ""
-
-
-def _is_image(path: Path) -> bool:
-    return path.suffix.lower() in IMAGE_SUFFIXES
 
 
 def _inside(path: Path, recursive: bool) -> tuple[list[Path], list[Path]]:

@@ -8,7 +8,6 @@ import importlib.util
 import pkgutil
 import sys
 from collections.abc import Iterator
-from email.message import Message
 from types import ModuleType
 from typing import Any
 
@@ -100,15 +99,10 @@ class _Versions(importlib.metadata.DistributionFinder):
 
 class _Distribution(importlib.metadata.Distribution):
     def __init__(self, name: str, version: str):
-        self._known = Message()
-        self._known["Name"], self._known["Version"] = name, version
+        self._text = f"Name: {name}\nVersion: {version}\n"
 
-    @property
-    def metadata(self) -> Any:
-        return self._known
-
-    def read_text(self, filename: str) -> None:
-        """Return None: there are no files."""
+    def read_text(self, filename: str) -> str | None:
+        return self._text if filename == "METADATA" else None
 
     def locate_file(self, path: Any) -> Any:
         return path

@@ -175,20 +175,6 @@ class _Moved(torch.autograd.Function):
         return None, None, v_theta, v_upper[:, 3] - upper[:, :3] @ v_center[0, 0]
 
 
-class _Scaled(torch.autograd.Function):
-    """Scales times the modifier; as in the original, the gradient ignores the modifier."""
-
-    @staticmethod
-    def forward(ctx: Any, scales: Tensor, modifier: float) -> Tensor:
-        """Return the product."""
-        return scales * modifier
-
-    @staticmethod
-    def backward(ctx: Any, *grads: Any) -> tuple[Tensor, None]:
-        """Return the gradient of the product."""
-        return grads[0], None
-
-
 class GaussianRasterizer(torch.nn.Module):
     """A rasterizer of one view.
 
@@ -209,12 +195,9 @@ class GaussianRasterizer(torch.nn.Module):
 
     @torch.no_grad()
     def visible_filter(
-        self,
-        means3D: Tensor,
-        scales: Tensor | None = None,
-        rotations: Tensor | None = None,
+        self, means3D: Tensor, scales: Tensor | None = None, rotations: Tensor | None = None,
         cov3D_precomp: Tensor | None = None,
-    ) -> Tensor:
+    ) -> Tensor:  # fmt: skip
         """Return the radii of ``forward``, which do not depend on opacities and colours."""
         check_tensor("means3D", means3D, ("N", 3), dtypes=DTYPES)
         settings, ones = _plain(self.raster_settings), torch.ones_like(means3D)
@@ -225,20 +208,12 @@ class GaussianRasterizer(torch.nn.Module):
         return _radii(_project(x, ones, settings, *_camera(settings, means3D.device)))
 
     def forward(
-        self,
-        means3D: Tensor,
-        means2D: Tensor,
-        opacities: Tensor,
-        shs: Tensor | None = None,
-        colors_precomp: Tensor | None = None,
-        scales: Tensor | None = None,
-        rotations: Tensor | None = None,
-        cov3D_precomp: Tensor | None = None,
-        theta: Tensor | None = None,
-        rho: Tensor | None = None,
-        means2D_densify: Tensor | None = None,
-        **others: Any,
-    ) -> tuple[Tensor, ...]:
+        self, means3D: Tensor, means2D: Tensor, opacities: Tensor, shs: Tensor | None = None,
+        colors_precomp: Tensor | None = None, scales: Tensor | None = None,
+        rotations: Tensor | None = None, cov3D_precomp: Tensor | None = None,
+        theta: Tensor | None = None, rho: Tensor | None = None,
+        means2D_densify: Tensor | None = None, **others: Any,
+    ) -> tuple[Tensor, ...]:  # fmt: skip
         """Render N Gaussians, differentiable in all arguments.
 
         Args:
@@ -279,19 +254,11 @@ class GaussianRasterizer(torch.nn.Module):
 
 
 def rasterize_gaussians(
-    means3D: Tensor,
-    means2D: Tensor,
-    sh: Tensor | None,
-    colors_precomp: Tensor | None,
-    opacities: Tensor,
-    scales: Tensor | None,
-    rotations: Tensor | None,
-    cov3Ds_precomp: Tensor | None,
-    raster_settings: GaussianRasterizationSettings,
-    theta: Tensor | None = None,
-    rho: Tensor | None = None,
-    means2D_densify: Tensor | None = None,
-) -> tuple[Tensor, ...]:
+    means3D: Tensor, means2D: Tensor, sh: Tensor | None, colors_precomp: Tensor | None,
+    opacities: Tensor, scales: Tensor | None, rotations: Tensor | None,
+    cov3Ds_precomp: Tensor | None, raster_settings: GaussianRasterizationSettings,
+    theta: Tensor | None = None, rho: Tensor | None = None, means2D_densify: Tensor | None = None,
+) -> tuple[Tensor, ...]:  # fmt: skip
     """Render as ``GaussianRasterizer``; an empty tensor is the same as None."""
     settings = _plain(raster_settings)
     x = _checked(
@@ -360,7 +327,9 @@ def _project(
     """Project by the original's conventions."""
     scales = x.get("scales")
     if scales is not None and settings.scale_modifier != 1:
-        scales = _Scaled.apply(scales, settings.scale_modifier)
+        # As in the original, the gradient ignores the modifier.
+        own = scales.detach()
+        scales = own * settings.scale_modifier + (scales - own)
     options = ProjectionOptions(
         settings.image_width, settings.image_height, NEAR, float("inf"), 0.0, EPS2D, ALPHA_MIN,
         bool(settings.antialiasing), skip_unused=True, original=True,

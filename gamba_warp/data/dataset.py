@@ -11,7 +11,7 @@ import hashlib
 import os
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import nullcontext, suppress
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
 from itertools import chain
@@ -33,21 +33,12 @@ from ..untrusted.documents import read_document
 from .layouts import (
     GOBJAVERSE,
     LAYOUTS,
-    DecodedImage,
-    EncodedImage,
+    MemoryImage,
     ObjectFiles,
     find_objects,
     one_line,
 )
-from .manifest import (
-    MANIFEST,
-    Entry,
-    Manifest,
-    list_of,
-    marks_of,
-    read_manifest,
-    write_manifest,
-)
+from .manifest import MANIFEST, Entry, Manifest, list_of, marks_of, read_manifest, write_manifest
 
 SPLITS = ("train", "val", "test")
 SPLIT_VERSION = 2  # of written files; version 1 had fewer objects in one group
@@ -143,15 +134,12 @@ def splits_of(folder: str | Path, uids: Iterable[str]) -> dict[str, str]:
     return {uid: stated.get(uid) or split_of(uid) for uid in uids}
 
 
-def open_dataset(
-    folder: str | Path, split: str = "all", layout: str = "auto", cache: bool = False
-) -> ViewDataset:
+def open_dataset(folder: str | Path, split: str = "all", cache: bool = False) -> ViewDataset:
     """Find the objects under a folder, without decoding anything yet.
 
     Args:
         folder: a dataset, or the folder of a single object.
         split: "all", "train", "val" or "test".
-        layout: "auto", "transforms", "nerf", "gobjaverse" or "openlrm".
         cache: keep decoded views in memory, with 8 bits a channel.
 
     Raises:
@@ -161,16 +149,14 @@ def open_dataset(
     root = Path(folder)
     if split not in ("all", *SPLITS):
         raise UserError(f"split '{split}': expected all, train, val or test")
-    if layout not in ("auto", *LAYOUTS):
-        raise UserError(f"layout '{layout}': expected auto, {', '.join(LAYOUTS)}")
     if not root.is_dir():
         raise UserError(f"{root}: no such folder")
     manifest = None
-    if layout == "auto" and (root / MANIFEST).exists():
+    if (root / MANIFEST).exists():
         manifest = read_manifest(root)
         layout, uids = manifest.layout, list(manifest.digests)
     else:
-        layout, folders, _ = find_objects(root, layout)
+        layout, folders, _ = find_objects(root)
         if not folders:
             if any(root.glob("shards-*.json")):
                 raise UserError(f"{root}: shards, which only gamba train reads")
@@ -217,7 +203,7 @@ def index_dataset(folder: str | Path) -> tuple[Path, int, dict[str, str]]:
     root = Path(folder)
     if not root.is_dir():
         raise UserError(f"{root}: no such folder")
-    layout, folders, others = find_objects(root, "auto")
+    layout, folders, others = find_objects(root)
     if not folders or folders == [root]:
         raise UserError(f"{root}: {'is one object' if folders else 'no objects found'}")
     lists = {p.relative_to(root).as_posix().removeprefix("."): list_of(str(p)) for p in others}
@@ -324,12 +310,8 @@ class ViewDataset:
             raise UserError(f"two objects are called '{twice[0]}'; rename a dataset's folder")
         cache = self._images is not None
         both = ViewDataset(self._readers | added, self.layout, cache, self.split_version)
-        for known, mine, theirs in (
-            (both._digests, self._digests, other._digests),
-            (both._bad, self._bad, other._bad),
-        ):
-            known |= mine
-            known |= {f"{name}/{uid}": value for uid, value in theirs.items()}
+        both._digests = self._digests | {f"{name}/{k}": x for k, x in other._digests.items()}
+        both._bad = self._bad | {f"{name}/{k}": reason for k, reason in other._bad.items()}
         return both
 
     def files(self, index: int | str) -> ObjectFiles:
@@ -532,11 +514,11 @@ class ViewDataset:
         return image, files.Ks[view] * np.array(factor)[:, None]
 
 
-def _read_rgba8(path: Path | DecodedImage) -> np.ndarray:
-    return path.read() if isinstance(path, DecodedImage) else load_rgba8(path)
+def _read_rgba8(path: Path | MemoryImage) -> np.ndarray:
+    return path.read() if isinstance(path, MemoryImage) else load_rgba8(path)
 
 
-def _masked(image: np.ndarray, path: Path | DecodedImage) -> np.ndarray:
+def _masked(image: np.ndarray, path: Path | MemoryImage) -> np.ndarray:
     """Multiply the alpha of RGBA ``[H, W, 4]`` uint8 with a grey image of the same size.
 
     A mask of zeros and ones counts as black and white, as in nerfstudio.
@@ -606,15 +588,9 @@ def _facing(camera_to_world: np.ndarray) -> float:
     return float((ahead >= 0.5 * np.linalg.norm(places, axis=-1)).sum() / max(1, len(places)))
 
 
-def _read_depth(path: Path | DecodedImage, width: int, height: int) -> np.ndarray:
+def _read_depth(path: Path | MemoryImage, width: int, height: int) -> np.ndarray:
     """Read depth ``[height, width]`` float32 in steps of the file, by nearest samples."""
-    if isinstance(path, EncodedImage):
-        opened = path.open()
-    elif isinstance(path, DecodedImage):
-        opened = nullcontext(Image.fromarray(path.read()))
-    else:
-        opened = open_image(path)
-    with opened as image:
+    with path.open() if isinstance(path, MemoryImage) else open_image(path) as image:
         if len(image.getbands()) != 1:
             raise UserError(f"{path}: has {len(image.getbands())} channels, depth has one")
         if image.size != (width, height):

@@ -22,13 +22,15 @@ import math
 import os
 from collections import Counter
 from collections.abc import Callable, Sequence
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, field
 from functools import cache, partial
 from pathlib import Path
-from typing import Annotated, Any, NamedTuple
+from typing import Annotated, Any, ClassVar
 
 import numpy as np
 from msgspec import Meta, Struct
+from PIL import Image
 
 from ..errors import UserError
 from ..files import walk
@@ -63,39 +65,37 @@ _FIT = 0.02  # tolerance for a simplified mesh, in sides of the cube
 IMAGES = (".webp", ".png", ".jpg", ".jpeg")
 
 
-class DecodedImage:
+@dataclass(frozen=True, eq=False)
+class MemoryImage:
     """Image in memory.
 
     Attributes:
+        name: for errors.
+        content: of a file; or RGBA ``[H, W, 4]`` uint8; or depth ``[H, W]`` float32 in steps.
         stem: empty, in place of a path's.
     """
 
-    stem = ""
-
-    def read(self) -> np.ndarray:
-        """Return the pixels: RGBA ``[H, W, 4]`` uint8, or depth ``[H, W]`` float32 in steps.
-
-        Raises:
-            UserError: the image is damaged.
-        """
-        raise NotImplementedError
-
-
-@dataclass(frozen=True, eq=False)
-class EncodedImage(DecodedImage):
-    """Content of an image's file, of a shard."""
-
     name: str
-    content: bytes
+    content: bytes | np.ndarray
+    stem: ClassVar[str] = ""
 
     def __str__(self) -> str:
         return self.name
 
     def read(self) -> np.ndarray:
+        """Return the pixels of a file, RGBA ``[H, W, 4]`` uint8, or the array.
+
+        Raises:
+            UserError: the image is damaged.
+        """
+        if isinstance(self.content, np.ndarray):
+            return self.content
         return load_rgba8(self.name, self.content)
 
-    def open(self):
+    def open(self) -> AbstractContextManager[Image.Image]:
         """Open it as ``images.open_image``."""
+        if isinstance(self.content, np.ndarray):
+            return nullcontext(Image.fromarray(self.content))
         return open_image(io.BytesIO(self.content), self.name)
 
 
@@ -150,13 +150,13 @@ class ObjectFiles:
         placement: of the rendered mesh, or None if unknown.
     """
 
-    images: Sequence[Path | DecodedImage]
+    images: Sequence[Path | MemoryImage]
     camera_to_world: np.ndarray
     Ks: np.ndarray
     sizes: Sequence[tuple[int, int] | None]
-    masks: Sequence[Path | DecodedImage] | None = None
-    depths: Sequence[Path | DecodedImage] | None = None
-    backs: Sequence[Path | DecodedImage] | None = None
+    masks: Sequence[Path | MemoryImage] | None = None
+    depths: Sequence[Path | MemoryImage] | None = None
+    backs: Sequence[Path | MemoryImage] | None = None
     depth_unit: float = 1.0
     name: str = ""
     attribution: dict[str, str] = field(default_factory=dict)
@@ -206,30 +206,26 @@ def check_cameras(
         focal, center = Ks[:, (0, 1), (0, 1)] / size, Ks[:, :2, 2] / size
         positive = np.isfinite(Ks).all((1, 2)) & (focal > 0).all(1)
         checks = {
-            "the pose is not finite, or over {most:g}": (np.abs(poses) <= _LARGEST).all((1, 2)),
+            f"the pose is not finite, or over {_LARGEST:g}": (np.abs(poses) <= _LARGEST).all(
+                (1, 2)
+            ),
             "the pose's 3x3 part is not a rotation": orthogonal & ~(np.linalg.det(rotations) < 0),
-            "the camera is {distance:g} from the object's centre, expected {near:g} to {far:g}": (
+            "the camera is {distance:g} from the object's centre, expected "
+            f"{NEAREST:g} to {FARTHEST:g}": (
                 (distances >= NEAREST) & (distances <= FARTHEST) | (not around_object)
             ),
             "focal lengths must be positive": positive,
             "focal lengths of {focal[0]:g} and {focal[1]:g} sides of the image, expected "
-            "{short:g} to {long:g}": ((focal >= SHORTEST) & (focal <= LONGEST)).all(1),
+            f"{SHORTEST:g} to {LONGEST:g}": ((focal >= SHORTEST) & (focal <= LONGEST)).all(1),
             "the principal point is far outside the image": (
                 ((center >= -1) & (center <= 2)).all(1)
             ),
             "the pose's last row is not 0 0 0 1": _is_last_row(poses[:, 3]),
         }
-    limits = {
-        "most": _LARGEST,
-        "near": NEAREST,
-        "far": FARTHEST,
-        "short": SHORTEST,
-        "long": LONGEST,
-    }
     for reason, valid in checks.items():
         if not valid.all():
             view = int(valid.argmin())
-            reason = reason.format(distance=distances[view], focal=focal[view], **limits)
+            reason = reason.format(distance=distances[view], focal=focal[view])
             raise UserError(f"{names[view]}: {reason}")
 
 
@@ -380,7 +376,7 @@ _PATHS = ("file_path", "mask_path", "depth_file_path", "back_file_path")
 
 
 # From a name in a document, and the document's for errors, to the image.
-Find = Callable[[Any, str], Path | DecodedImage]
+Find = Callable[[Any, str], Path | MemoryImage]
 
 
 def _images(path: Path | str, frames: list[dict], find: Find) -> dict[str, list]:
@@ -405,7 +401,7 @@ def _images(path: Path | str, frames: list[dict], find: Find) -> dict[str, list]
     return files
 
 
-def _with_suffix(image: Path | DecodedImage) -> Path | DecodedImage:
+def _with_suffix(image: Path | MemoryImage) -> Path | MemoryImage:
     """Blender omits the suffix; a dot may then be part of the name."""
     if not isinstance(image, Path) or image.suffix.lower() in IMAGE_SUFFIXES:
         return image
@@ -478,7 +474,7 @@ def object_of(documents: Sequence[tuple[Path | str, object, Find]]) -> ObjectFil
     )
 
 
-def _size_of(image: Path | DecodedImage) -> tuple[int, int]:
+def _size_of(image: Path | MemoryImage) -> tuple[int, int]:
     if isinstance(image, Path):
         return image_size(image, turned=False)
     height, width = image.read().shape[:2]
@@ -509,11 +505,6 @@ class _View(Struct):
     y_fov: float | None = None
 
 
-def _aspect(image: Path) -> float:
-    width, height = image_size(image, turned=False)
-    return width / height
-
-
 def _read_gobjaverse(folder: Path) -> ObjectFiles:
     found = sorted(p for p in (folder / GOBJAVERSE).iterdir() if p.is_dir())
     _check_count(len(found), folder)
@@ -529,9 +520,10 @@ def _read_gobjaverse(folder: Path) -> ObjectFiles:
         pose = _matrix(list(zip(camera.x, camera.y, camera.z, camera.origin)), name)
         pose[:3, 1:3] *= -1  # OpenCV to OpenGL
         poses.append(pose)
-        if camera.x_fov is None or camera.y_fov is None:
+        if not aspect and (camera.x_fov is None or camera.y_fov is None):
             # Pixels are square, the image may not be.
-            aspect = aspect or _aspect(inside(views[0], f"{views[0].name}.png", name))
+            width, height = _size_of(inside(views[0], f"{views[0].name}.png", name))
+            aspect = width / height
         if camera.x_fov is None:
             focal_x = GOBJAVERSE_FOCAL / aspect
         else:
@@ -577,30 +569,19 @@ LAYOUTS: dict[str, tuple[str, Callable[[Path], ObjectFiles]]] = {
 }
 
 
-class Found(NamedTuple):
-    """Objects under a folder.
-
-    Attributes:
-        layout: name of their layout.
-        objects: their folders, sorted.
-        others: the other folders that were searched.
-    """
-
-    layout: str
-    objects: list[Path]
-    others: list[Path]
-
-
-def find_objects(root: Path, layout: str) -> Found:
+def find_objects(root: Path) -> tuple[str, list[Path], list[Path]]:
     """Find the objects' folders at any depth.
 
-    ``root`` itself may be an object. ``layout`` "auto" takes the layout of the first object found.
-    Folders with a leading dot are skipped; linked folders are entered (``files.walk``).
+    ``root`` itself may be an object. All have the layout of the first one found. Folders with a
+    leading dot are skipped; linked folders are entered (``files.walk``).
+
+    Returns:
+        The name of the layout, the objects' folders, sorted, and the other folders searched.
 
     Raises:
         UserError: the folders are nested too deep.
     """
-    marks = {mark: name for name, (mark, _) in LAYOUTS.items() if layout in ("auto", name)}
+    marks, layout = {mark: name for name, (mark, _) in LAYOUTS.items()}, ""
     found, others = [], []
     for folder, subfolders, files in walk(root):
         if folder.count(os.sep) > str(root).count(os.sep) + _MAX_DEPTH:
@@ -611,4 +592,4 @@ def find_objects(root: Path, layout: str) -> Found:
             found.append(Path(folder))
         else:
             others.append(Path(folder))
-    return Found(layout, sorted(found), others)
+    return layout, sorted(found), others

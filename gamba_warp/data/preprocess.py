@@ -44,9 +44,18 @@ def has_alpha(rgba: np.ndarray, any_fraction: bool = False) -> bool:
     pixel.
     """
     clear = rgba[..., 3] < _TRANSPARENT
-    border = np.concatenate([clear[0], clear[-1], clear[:, 0], clear[:, -1]])
-    fractions = border.mean() >= _CUT_BORDER or clear.mean() >= _CUT_FRACTION
+    fractions = border_of(clear).mean() >= _CUT_BORDER or clear.mean() >= _CUT_FRACTION
     return bool(clear.any() and (any_fraction or fractions))
+
+
+def border_of(image: np.ndarray) -> np.ndarray:
+    """Return the pixels ``[P, ..]`` of the border of ``[H, W, ..]``, those of the corners twice."""
+    return np.concatenate([image[0], image[-1], image[:, 0], image[:, -1]])
+
+
+def planes_of(image: np.ndarray) -> Tensor:
+    """Return ``[H, W, C]`` as ``[1, C, H, W]`` float32."""
+    return torch.from_numpy(np.ascontiguousarray(image, np.float32)).permute(2, 0, 1)[None]
 
 
 def read_mask(mask: str | Path, path: str | Path) -> np.ndarray:
@@ -131,7 +140,7 @@ def shrink(rgba: np.ndarray, longest: int) -> np.ndarray:
 def resize_rgba(rgba: np.ndarray, height: int, width: int) -> np.ndarray:
     """Resize ``[H, W, 4]`` in [0, 1], straight alpha, with colours weighted by alpha."""
     alpha = rgba[..., 3:]
-    small = _resize(np.dstack([rgba[..., :3] * alpha, alpha]), height, width)
+    small = resize(np.dstack([rgba[..., :3] * alpha, alpha]), height, width)
     small[..., :3] /= np.maximum(small[..., 3:], 1e-6)
     return small.clip(0.0, 1.0)
 
@@ -143,13 +152,13 @@ def composite(rgba: np.ndarray, size: int, background: float = 1.0) -> Tensor:
         ``[size, size, 3]`` float32 in [0, 1].
     """
     flat = over_background(rgba, background)
-    return torch.from_numpy(_resize(flat, size, size)).clamp(0, 1)
+    return torch.from_numpy(resize(flat, size, size)).clamp(0, 1)
 
 
-def _resize(image: np.ndarray, height: int, width: int) -> np.ndarray:
-    planes = torch.from_numpy(np.ascontiguousarray(image, np.float32)).permute(2, 0, 1)[None]
+def resize(image: np.ndarray, height: int, width: int) -> np.ndarray:
+    """Resize ``[H, W, C]``, bilinear and antialiased, to float32."""
     out = torch.nn.functional.interpolate(
-        planes, (height, width), mode="bilinear", align_corners=False, antialias=True
+        planes_of(image), (height, width), mode="bilinear", align_corners=False, antialias=True
     )
     return out[0].permute(1, 2, 0).contiguous().numpy()
 
@@ -194,10 +203,9 @@ class SamSegmenter:
     def __call__(self, rgb: np.ndarray) -> np.ndarray:
         """Return alpha ``[H, W]`` float32, 0 or 1, from RGB ``[H, W, 3]`` in [0, 1]."""
         height, width = rgb.shape[:2]
-        image = torch.from_numpy(np.ascontiguousarray(rgb, np.float32)).permute(2, 0, 1)
         box = torch.tensor([[0.1 * width, 0.1 * height, 0.9 * width, 0.9 * height]])
         with torch.inference_mode():
-            self._prompter.set_image(image.to(self._prompter.device))
+            self._prompter.set_image(planes_of(rgb)[0].to(self._prompter.device))
             result = self._prompter.predict(
                 boxes=box.to(self._prompter.device), multimask_output=False
             )

@@ -79,8 +79,8 @@ def find_meshes(folder: Path) -> list[Mesh]:
         if uid in meshes:
             raise UserError(f"{path} and {meshes[uid].path} would both be named '{uid}'")
         name, group = entry.name or parts[-1], entry.group or uid
-        about = entry.attribution or {}, entry.rotation, folder
-        meshes[uid] = Mesh(path, uid, name, group, *about)
+        attribution = entry.attribution or {}
+        meshes[uid] = Mesh(path, uid, name, group, attribution, entry.rotation, folder)
     if not meshes:
         raise UserError(f"{folder}: no mesh files ({', '.join(MESH_SUFFIXES)})")
     return [meshes[uid] for uid in sorted(meshes)]
@@ -150,20 +150,18 @@ def object_names(paths: Sequence[PurePath]) -> list[str]:
 
 def _name_parts(paths: Sequence[PurePath]) -> list[tuple[str, ...]]:
     """Return the parts of each path that name its object."""
-    short = [_identifying(path.parts) for path in paths]
+    short: list[tuple[str, ...]] = []
     owners: dict[str, set[PurePath]] = {}
-    for path, parts in zip(paths, short):
-        owners.setdefault(_uid(parts), set()).add(path)
+    for path in paths:
+        parts = path.parts
+        while len(parts) > 1 and parts[-1].lower() in NO_NAMES:
+            parts = parts[:-1]
+        short.append(_once(parts))
+        owners.setdefault(_uid(short[-1]), set()).add(path)
     return [
         parts if len(owners[_uid(parts)]) == 1 else _once(path.parts)
         for path, parts in zip(paths, short)
     ]
-
-
-def _identifying(parts: tuple[str, ...]) -> tuple[str, ...]:
-    while len(parts) > 1 and parts[-1].lower() in NO_NAMES:
-        parts = parts[:-1]
-    return _once(parts)
 
 
 def _once(parts: tuple[str, ...]) -> tuple[str, ...]:

@@ -19,7 +19,6 @@ from .headers import MAX_VALUES, Source, read_rows
 from .ply_data import PlyData
 
 MAX_POINTS = MAX_VALUES // 3
-_AXES = ("x", "y", "z")
 
 
 class Cloud(NamedTuple):
@@ -53,7 +52,6 @@ def read_xyz(source: Source) -> Cloud:
         UserError: the file has over ``MAX_POINTS`` points or none, a word is not a number, the
             rows differ in length, or a point is not finite.
     """
-    source.check()
     path = source.path
     table = read_rows(source.file.read(), str(path), comments=True).table(str(path))
     if len(table) and table.shape[1] < 3:
@@ -63,7 +61,7 @@ def read_xyz(source: Source) -> Cloud:
 
 def cloud_of(path: Path, data: PlyData) -> Cloud:
     """Return the cloud of a ``.ply`` file's content. Raises UserError as ``read_xyz``."""
-    positions = data.numbers("vertex", _AXES)
+    positions = data.numbers("x", "y", "z")
     if positions is None:
         raise UserError(f"{path}: its vertices have no x, y and z")
-    return _checked(path, positions, data.numbers("vertex", ("nx", "ny", "nz")))
+    return _checked(path, positions, data.numbers("nx", "ny", "nz"))

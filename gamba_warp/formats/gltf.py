@@ -17,15 +17,7 @@ from PIL import Image
 
 from ..color_spaces import to_display
 from ..errors import UserError
-from .gltf_file import (
-    INSTANCING,
-    MAX_PRIMITIVES,
-    PACKED,
-    Entry,
-    GltfFile,
-    Index,
-    normalised,
-)
+from .gltf_file import INSTANCING, MAX_PRIMITIVES, PACKED, Entry, GltfFile, Index, normalised
 from .materials import Material, SideFiles, plain
 from .parts import Part, strip_faces, to_rgba8
 

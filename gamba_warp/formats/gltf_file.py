@@ -299,7 +299,6 @@ def open_gltf(source: Source, sides: SideFiles) -> GltfFile:
             packs triangles.
     """
     path, file, size = source
-    source.check()
     text, binary = file.read(), None
     if path.suffix.lower() != ".gltf":
         text, binary = _chunks(path, text, size)

@@ -30,20 +30,12 @@ from .ply_data import parse_ply
 from .ply_mesh import ply_parts
 from .stl import read_stl
 
-
-def _read_gltf(source: Source, sides: SideFiles) -> Iterator[Part]:
-    return gltf_parts(open_gltf(source, sides), sides)
-
-
-def _read_ply(source: Source, sides: SideFiles) -> Iterator[Part]:
-    return ply_parts(parse_ply(source), sides)
-
-
 _READERS: dict[str, Callable[[Source, SideFiles], Iterator[Part]]] = {
+    **dict.fromkeys(
+        (".glb", ".gltf"), lambda file, sides: gltf_parts(open_gltf(file, sides), sides)
+    ),
+    ".ply": lambda file, sides: ply_parts(parse_ply(file), sides),
     ".obj": read_obj,
-    ".glb": _read_gltf,
-    ".gltf": _read_gltf,
-    ".ply": _read_ply,
     ".stl": read_stl,
     ".off": read_off,
 }
@@ -161,7 +153,6 @@ def load_mesh(path: str | Path, root: Path | None = None) -> TexturedMesh:
 
 def read_mesh(source: Source, sides: SideFiles) -> TexturedMesh:
     """Read an open file by its suffix, one of ``MESH_SUFFIXES``; errors as for ``load_mesh``."""
-    source.check()
     return mesh_of(_READERS[source.path.suffix.lower()](source, sides), sides)
 
 

@@ -67,7 +67,8 @@ def read_obj(source: Source, sides: SideFiles) -> Iterator[Part]:
     if beyond.any():
         sides.warnings.append("faces name texture coordinates or normals that are not there")
         corners[beyond] = -1
-    group = found.materials_of(np.concatenate(found.faces))
+    at, used = np.transpose(found.used)
+    group = used[np.searchsorted(at, np.concatenate(found.faces)) - 1]
     if (lengths != 3).any():
         group = np.repeat(group, np.maximum(lengths - 2, 0))
     numbers, first = np.unique(group, return_index=True)
@@ -117,6 +118,7 @@ class _Statements:
         lengths: by block ``[F]``, number of corners of each face.
         faces: by block ``[F]``, line of each face.
         names: numbers of the materials by name; 0 for faces without a material.
+        used: lines of usemtl, and numbers of the materials.
         libraries: names of MTL files.
         unread: first words of other statements.
     """
@@ -127,7 +129,7 @@ class _Statements:
         self.corners, self.lengths, self.faces = [np.zeros((0, 3), np.int64)], [none], [none]
         self.libraries, self.unread = list[str](), set[str]()
         self.names = {"": 0}
-        self._used = [(-1, 0)]  # lines of usemtl, and numbers of the materials
+        self.used = [(-1, 0)]
         self._totals = np.zeros(3, np.int64)  # of v, vt and vn in the blocks before
         line = 0
         for block in blocks_of(text, str(path)):
@@ -135,11 +137,6 @@ class _Statements:
             if not self._read(path, lines, line):
                 raise _invalid_line(path, block, line)
             line += len(lines.sizes)
-
-    def materials_of(self, lines: np.ndarray) -> np.ndarray:
-        """Return the numbers of the materials of faces at these lines."""
-        at, numbers = np.transpose(self._used)
-        return numbers[np.searchsorted(at, lines) - 1]
 
     def _read(self, path: Path, lines: Lines, start: int) -> bool:
         """Read a block whose first line has this number; return False if a line is invalid."""
@@ -177,7 +174,7 @@ class _Statements:
             if word == b"mtllib":
                 self.libraries.append(name)
             elif word == b"usemtl":
-                self._used.append((start + at, self.names.setdefault(name, len(self.names))))
+                self.used.append((start + at, self.names.setdefault(name, len(self.names))))
             elif word.isalpha() and word.islower():
                 self.unread.add(word[:30].decode())
         return True

@@ -29,8 +29,9 @@ from .gaussians.arrays import (
     rest_names,
 )
 from .gaussians.compressed import unpacked
+from .headers import open_shape
 from .parts import color_range
-from .ply_data import WORDS, PlyData, read_ply
+from .ply_data import MAX_SPLATS, WORDS, PlyData, parse_ply
 
 MIP = "SplatRenderMode: mip"  # comment of Gaussians that were fitted with antialiasing
 TURNED = "frame opengl"  # comment of files with y up, which earlier versions could write
@@ -96,14 +97,14 @@ def header_bytes(comments: Iterable[str], elements: Iterable[str]) -> bytes:
     return "\n".join([*lines, *elements, "end_header", ""]).encode("ascii", "replace")
 
 
-def load_ply(path: str | Path, left_out: list[str] | None = None) -> Gaussians:
+def load_ply(path: str | Path) -> Gaussians:
     """Read a 3DGS ``.ply``, from this or another program, as one object.
 
     It may be binary, text, or compressed (``formats.gaussians.compressed``). Normals and other
     elements are ignored, other properties named by a warning. Without ``f_dc_*``,
     ``red green blue`` are the colours, as nerfstudio's ``ns-export`` writes them. Two scales, of
     flat Gaussians (2DGS), get a third of 1e-6. A scale of -inf is size 0; an opacity of inf is 1,
-    of -inf 0. ``left_out`` as for ``checked_gaussians``.
+    of -inf 0.
 
     Returns:
         Float32 Gaussians on the CPU, ``quats`` normalised.
@@ -113,14 +114,19 @@ def load_ply(path: str | Path, left_out: list[str] | None = None) -> Gaussians:
             attribute is missing, the Gaussians change with time, or ``checked_gaussians`` refuses
             them.
     """
-    return ply_gaussians(Path(path), read_ply(Path(path)), left_out)
+    with open_shape(Path(path), MAX_SPLATS) as source:
+        return ply_gaussians(source.path, parse_ply(source))
 
 
 def ply_gaussians(path: Path, data: PlyData, left_out: list[str] | None = None) -> Gaussians:
-    """Return the Gaussians of a file's content, as ``load_ply`` does."""
-    packed = data.header.is_packed
+    """Return the Gaussians of a file's content, as ``load_ply`` does.
+
+    ``left_out`` as for ``checked_gaussians``.
+    """
+    given = data.elements.get("vertex", {}).keys()
+    packed = not given.isdisjoint(WORDS)
     read = {*WORDS} if packed else {name for names in _GROUPS.values() for name in names}
-    unread = data.elements.get("vertex", {}).keys() - read - {*_WITHOUT_EFFECT}
+    unread = given - read - {*_WITHOUT_EFFECT}
     names = ", ".join(sorted(name for name in unread if not _REST.fullmatch(name)))
     if any(_TIME.fullmatch(name) for name in unread):
         advice = "write those of one moment as a .ply of 3DGS"

@@ -16,7 +16,6 @@ from .headers import (
     Source,
     check_lines,
     compare_sizes,
-    open_shape,
     read_rows,
 )
 
@@ -76,12 +75,6 @@ class PlyHeader(NamedTuple):
         names = {item.name for element in self.elements for item in element.properties}
         return not self.has_faces and not names.isdisjoint(_GAUSSIANS)
 
-    @property
-    def is_packed(self) -> bool:
-        """True for Gaussians of a compressed ``.ply``."""
-        vertices = (x.properties for x in self.elements if x.name == "vertex")
-        return any(item.name in WORDS for properties in vertices for item in properties)
-
 
 class PlyList(NamedTuple):
     """A property whose values are lists."""
@@ -99,9 +92,9 @@ class PlyData(NamedTuple):
     header: PlyHeader
     elements: dict[str, Columns]
 
-    def numbers(self, element: str, names: tuple[str, ...]) -> np.ndarray | None:
-        """Return properties of an element, ``[N, C]`` float64; None if one is missing."""
-        found = [self.elements.get(element, {}).get(name) for name in names]
+    def numbers(self, *names: str) -> np.ndarray | None:
+        """Return properties of the vertices, ``[N, C]`` float64; None if one is missing."""
+        found = [self.elements.get("vertex", {}).get(name) for name in names]
         if not all(isinstance(column, np.ndarray) for column in found):
             return None
         return np.stack([np.asarray(column, np.float64) for column in found], 1)
@@ -155,18 +148,8 @@ def _property(path: Path, words: list[str]) -> PlyProperty:
     return PlyProperty(words[-1].lower(), kinds[-1], kinds[0] if is_list else "")
 
 
-def read_ply(path: Path) -> PlyData:
-    """Read every element of a ``.ply`` file, text or binary.
-
-    Raises:
-        UserError: as for ``parse_ply``, or the file cannot be read.
-    """
-    with open_shape(path, MAX_SPLATS) as source:
-        return parse_ply(source)
-
-
 def parse_ply(source: Source) -> PlyData:
-    """Read every element of an open ``.ply`` file.
+    """Read every element of an open ``.ply`` file, text or binary.
 
     Raises:
         UserError: not a ``.ply`` file, too large, it holds less or more than its header states, a

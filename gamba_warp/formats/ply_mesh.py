@@ -28,7 +28,7 @@ def ply_parts(data: PlyData, sides: SideFiles) -> Iterator[Part]:
     """
     path = sides.path
     vertices, faces = data.elements.get("vertex", {}), data.elements.get("face", {})
-    points = data.numbers("vertex", ("x", "y", "z"))
+    points = data.numbers("x", "y", "z")
     strips = {} if faces else data.elements.get("tristrips", {})
     found = [(faces or strips).get(name) for name in _CORNERS]
     lists = [x for x in found if isinstance(x, PlyList)]
@@ -44,7 +44,7 @@ def ply_parts(data: PlyData, sides: SideFiles) -> Iterator[Part]:
         lengths = np.full(len(given) // 3, 3)
     places = cut_polygons(sides, points, given, lengths)
     corners = given.astype(np.int64)[places]
-    normals, colors = data.numbers("vertex", ("nx", "ny", "nz")), _colors(vertices)
+    normals, colors = data.numbers("nx", "ny", "nz"), _colors(vertices)
     if colors is not None:
         colors = colors[corners]
     elif (of_faces := _colors(faces)) is not None:
@@ -53,7 +53,7 @@ def ply_parts(data: PlyData, sides: SideFiles) -> Iterator[Part]:
     names = next((pair for pair in _UVS if {*pair} <= vertices.keys()), None)
     if isinstance(of_corners, PlyList) and (of_corners.lengths == 2 * lengths).all():
         uvs = of_corners.values.reshape(-1, 2)[places]
-    elif names is not None and (found := data.numbers("vertex", names)) is not None:
+    elif names is not None and (found := data.numbers(*names)) is not None:
         uvs = found[corners]
     material = None
     files = [m[1].strip() for m in map(_TEXTURE.match, data.header.comments) if m]

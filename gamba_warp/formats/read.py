@@ -28,11 +28,7 @@ from .ply_data import MAX_SPLATS, parse_ply
 from .ply_mesh import ply_parts
 
 # From a file's axes to z-up, by their names.
-TO_Z_UP = {
-    "opencv": Y_TO_Z_UP * [1.0, -1.0, -1.0],
-    "opengl": Y_TO_Z_UP,
-    "z-up": np.eye(3),
-}
+TO_Z_UP = {"opencv": Y_TO_Z_UP * [1.0, -1.0, -1.0], "opengl": Y_TO_Z_UP, "z-up": np.eye(3)}
 UNKNOWN = "unknown"  # axes
 _CONVERTED = (".sog", ".ksplat", ".rad")  # Gaussians in formats of single programs
 _WORDS = {Gaussians: "Gaussians", TexturedMesh: "a mesh", Cloud: "points"}
@@ -86,9 +82,12 @@ def read(path: str | Path, drop_bad: bool = False, only: type | None = None) -> 
 def _read(source: Source, left_out: list[str] | None, only: type | None) -> ShapeFile:
     path, suffix, head = source.path, source.path.suffix.lower(), source.head(4)
     spz = head.startswith(GZIP) or head == MAGIC
+    ply = head.startswith(b"ply") or (suffix == ".ply" and not spz)
+    if not ply:  # the header of a .ply says which limit applies
+        source.check()
     sides, comments, axes = SideFiles(path), [], "opengl" if suffix in Y_UP else UNKNOWN
     build: Callable[[], Any]
-    if head.startswith(b"ply") or (suffix == ".ply" and not spz):
+    if ply:
         data = parse_ply(source)
         comments = [line[:200] for line in data.header.comments if line != TURNED][:32]
         stated = {f"axes {name}": name for name in TO_Z_UP}

@@ -24,10 +24,12 @@ from ..data.preprocess import (
     PRESENT,
     WORKING_SIZE,
     SamSegmenter,
+    border_of,
     has_alpha,
+    planes_of,
     read_mask,
     recenter,
-    resize_rgba,
+    resize,
     shrink,
     without_specks,
 )
@@ -92,6 +94,8 @@ class CutoutOptions:
         notify: called with a line before anything is fetched, and if the matting model is missing.
         cutout: the only method to use; auto: the first that finds an object.
         keep_holes: keep enclosed areas of a plain background's colour.
+        without_network: True once the matting model was found to be unavailable, as ``notify``
+            reported.
     """
 
     mask: str | Path | None = None
@@ -105,7 +109,7 @@ class CutoutOptions:
     keep_holes: bool = False
     _segmenter: SamSegmenter | None = field(default=None, init=False, repr=False)
     _matte: Matte | None = field(default=None, init=False, repr=False)
-    _no_matte: bool = field(default=False, init=False, repr=False)
+    without_network: bool = field(default=False, init=False, repr=False)
 
     def checked(self) -> CutoutOptions:
         """Open the given files, so that errors come before any image; return ``self``.
@@ -125,11 +129,6 @@ class CutoutOptions:
             self.matte()
         return self
 
-    @property
-    def without_network(self) -> bool:
-        """True once the matting model was found to be unavailable, as ``notify`` reported."""
-        return self._no_matte
-
     def segmenter(self) -> SamSegmenter | None:
         """Return Segment Anything, opened once; None if not requested."""
         if self._segmenter is None and self.sam is not None:
@@ -138,11 +137,11 @@ class CutoutOptions:
 
     def matte(self) -> Matte | None:
         """Return the matting model, opened once; None if unavailable, reported by ``notify``."""
-        if self._matte is None and not self._no_matte:
+        if self._matte is None and not self.without_network:
             try:
                 self._matte = Matte(self.matte_model, self.fetch, self.notify)
             except NoMatte as error:
-                self._no_matte = True
+                self.without_network = True
                 self.notify(str(error))
         return self._matte
 
@@ -321,7 +320,7 @@ def _at_own_pixels(
         (max(0, each[0] - spare), min(n, each[-1] + 1 + spare))
         for each, n in zip((rows, columns), rgba.shape)
     ]
-    small = rgba[tuple(slice(*ends) for ends in box)]
+    small = rgba[tuple(slice(*ends) for ends in box)][..., 3:]
     part = whole[tuple(slice(round(a * scale), round(b * scale)) for a, b in box)]
     part = shrink(part, WORKING_SIZE)
     around = part[..., :3]
@@ -329,7 +328,7 @@ def _at_own_pixels(
         return without_matte(part)[0], around
     if found.method == "mask":
         return without_background(around, part[..., 3]), around
-    alpha = resize_rgba(small, *part.shape[:2])[..., 3]
+    alpha = resize(small, *part.shape[:2])[..., 0].clip(0, 1)
     same = copy.copy(options)  # with its opened networks
     same.cutout = "matte" if found.method == "sam" else found.method
     try:
@@ -408,15 +407,12 @@ def doubts_of(rgb: np.ndarray, alpha: np.ndarray) -> list[str]:
         sizes = np.bincount(np.asarray(label(inside)).ravel())[1:]
         if (parts := int((sizes >= _PART * sizes.max(initial=1)).sum())) > 1:
             found.append(f"it has {parts} separate parts")
-    planes = torch.from_numpy(np.ascontiguousarray(alpha, np.float32))[None, None]
+    planes = planes_of(alpha[..., None])
     grown = torch.nn.functional.max_pool2d(planes, 3, 1, 1)[0, 0].numpy() > 0.5
     outline = grown & ~inside
     ours, theirs = (x[0].permute(1, 2, 0).numpy() for x in local_colors(rgb, alpha, 3))
-    alike = (
-        (np.abs(ours - theirs).max(-1)[outline] < _MIN_EDGE_CONTRAST).mean()
-        if outline.any()
-        else 0.0
-    )
+    weak = np.abs(ours - theirs).max(-1)[outline] < _MIN_EDGE_CONTRAST
+    alike = weak.mean() if outline.any() else 0.0
     if alike > _MAX_WEAK_FRACTION:
         found.append(f"along {alike:.0%} of its outline it looks like the background")
     unsure = ((planes > 0.1) & (planes < 0.9)).float()
@@ -428,7 +424,7 @@ def doubts_of(rgb: np.ndarray, alpha: np.ndarray) -> list[str]:
 
 def _on_border(inside: np.ndarray) -> float:
     """Return the fraction of an image's border that an object ``[H, W]`` bool covers."""
-    return float(np.concatenate([inside[0], inside[-1], inside[:, 0], inside[:, -1]]).mean())
+    return float(border_of(inside).mean())
 
 
 def fault_of(alpha: np.ndarray) -> str | None:

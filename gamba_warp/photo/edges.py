@@ -12,6 +12,8 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
+from ..data.preprocess import planes_of
+
 _SOLID = 0.99  # alpha from which a pixel has the object's colour alone
 _EDGE = 0.05, 0.95  # alpha of the edge's pixels
 _REACH = 2  # pixels between these and solid ones
@@ -69,7 +71,7 @@ def without_background(rgb: np.ndarray, alpha: np.ndarray) -> np.ndarray:
         alpha: ``[H, W]`` in [0, 1].
     """
     alpha = _narrowed(rgb, alpha)
-    image, fraction = _planes(rgb), _planes(alpha[..., None])
+    image, fraction = planes_of(rgb), planes_of(alpha[..., None])
     ours, theirs = local_colors(rgb, alpha, max(2, max(rgb.shape[:2]) // 64))
     colors = ours + fraction * (image - fraction * ours - (1 - fraction) * theirs)
     colors = torch.where(fraction > _SOLID, image, colors).clamp(0, 1)
@@ -90,7 +92,7 @@ def _narrowed(
         background: ``[H, W, 3]``; None for the local mean outside the boundary.
     """
     width = max(2, max(rgb.shape[:2]) // _WIDTH)
-    own = _planes(alpha[..., None])
+    own = planes_of(alpha[..., None])
     solid = (own > 0.5).float()
     near, known = _around(rgb, _eroded(solid, width + 1)[0, 0].numpy(), width + 3)
     boundary = (solid > _eroded(solid, width)) & (known > 0)
@@ -99,8 +101,8 @@ def _narrowed(
         theirs, known = _around(rgb, outside, width + 3)
         boundary &= known > 0
     else:
-        theirs = _planes(background)
-    added, full = _planes(rgb) - near, theirs - near
+        theirs = planes_of(background)
+    added, full = planes_of(rgb) - near, theirs - near
     fraction = (_dot(added, full) / _dot(full, full).clamp(min=1e-3)).clamp(0, 1)
     excess = (fraction - (1 - own)).clamp(min=0)
     whole, left = (_dot(x, x)[boundary].double() for x in (added, added - fraction * full))
@@ -131,13 +133,8 @@ def local_colors(rgb: np.ndarray, alpha: np.ndarray, radius: int) -> tuple[Tenso
 
 def _around(rgb: np.ndarray, weight: np.ndarray, radius: int) -> tuple[Tensor, Tensor]:
     """Return weighted means ``[1, 3, H, W]`` around each pixel, and the mean weight there."""
-    fraction, size = _planes(weight[..., None]), 2 * radius + 1
-    mean = torch.cat([_planes(rgb) * fraction, fraction], 1)
+    fraction, size = planes_of(weight[..., None]), 2 * radius + 1
+    mean = torch.cat([planes_of(rgb) * fraction, fraction], 1)
     for kernel, pad in (((size, 1), (radius, 0)), ((1, size), (0, radius))):  # first the columns
         mean = F.avg_pool2d(mean, kernel, 1, pad)
     return mean[:, :3] / mean[:, 3:].clamp(min=1e-5), mean[:, 3:]
-
-
-def _planes(image: np.ndarray) -> Tensor:
-    """Return ``[H, W, C]`` as ``[1, C, H, W]`` float32."""
-    return torch.from_numpy(np.ascontiguousarray(image, np.float32)).permute(2, 0, 1)[None]

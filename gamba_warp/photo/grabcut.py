@@ -15,6 +15,8 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
+from ..data.preprocess import planes_of, resize
+
 _SIDE = 256  # longer side of the segmented image, pixels
 _LEAST = 16  # smallest shorter side of an image, pixels
 _ROUNDS = 5  # of mixtures and cut
@@ -45,17 +47,10 @@ def grabcut(rgb: np.ndarray) -> np.ndarray:
         return np.zeros((height, width), np.float32)
     factor = min(1.0, _SIDE / max(height, width))
     small = (max(4, round(height * factor)), max(4, round(width * factor)))
-    image = torch.from_numpy(np.ascontiguousarray(rgb, np.float32)).permute(2, 0, 1)[None]
-    colors = _resized(image, small)[0].permute(1, 2, 0).contiguous().numpy()
-    inside = _connected(torch.from_numpy(_cut(colors))[None, None].float())
-    alpha = _resized(inside, (height, width))
-    return _guided_filter(alpha, image, max(1, round(1 / factor)))[0, 0].clamp(0, 1).numpy()
-
-
-def _resized(planes: Tensor, size: tuple[int, int]) -> Tensor:
-    return functional.interpolate(
-        planes, size, mode="bilinear", align_corners=False, antialias=True
-    )
+    inside = _connected(planes_of(_cut(resize(rgb, *small))[..., None]))
+    alpha = planes_of(resize(inside[0, 0, ..., None].numpy(), height, width))
+    found = _guided_filter(alpha, planes_of(rgb), max(1, round(1 / factor)))
+    return found[0, 0].clamp(0, 1).numpy()
 
 
 def _cut(colors: np.ndarray) -> np.ndarray:

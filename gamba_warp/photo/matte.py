@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from ..data.preprocess import resize_rgba
+from ..data.preprocess import resize
 from ..errors import UserError, first_line
 from ..images import to_uint8
 from ..untrusted.children import Failed, run_each
@@ -50,12 +50,19 @@ class Matte:
                 require("onnxruntime")
             raise NoMatte(f"onnxruntime is not installed: {to_install('photo')}")
         self._given = file is not None
-        if file is None or models.is_address(file):
+        if file is None or str(file).startswith(("https://", "http://")):
             self.path = _fetched(None if file is None else str(file), fetch or self._given, say)
         else:
             self.path = Path(file)
-        self._version = _version_of(self.path) if self._given else (0, 0)
+        self._version = (0, 0)
         if self._given:
+            if not self.path.is_file():
+                reason = "not a plain file" if self.path.exists() else "no such file"
+                raise UserError(f"--matte-model {self.path}: {reason}")
+            found = os.stat(self.path)
+            if found.st_size > MAX_MODEL:
+                raise UserError(f"--matte-model {self.path}: is over {MAX_MODEL >> 30} GB")
+            self._version = found.st_size, found.st_mtime_ns
             self._run(None)
 
     def __call__(self, rgb: np.ndarray) -> np.ndarray:
@@ -67,9 +74,7 @@ class Matte:
         """
         alpha = self._run(to_uint8(rgb))
         assert alpha is not None
-        # resize_rgba weights colours by alpha; only its alpha is used here.
-        planes = np.dstack([np.zeros((*alpha.shape, 3), np.float32), alpha])
-        return resize_rgba(planes, *rgb.shape[:2])[..., 3]
+        return resize(alpha[..., None], *rgb.shape[:2])[..., 0].clip(0, 1)
 
     def _run(self, rgb: np.ndarray | None) -> np.ndarray | None:
         task = (str(self.path.absolute()), self._version, rgb, torch.get_num_threads())
@@ -83,17 +88,6 @@ class Matte:
         if self._given:
             raise UserError(f"--matte-model {self.path}: {reason}")
         raise NoMatte(f"{self.path}: {reason}")
-
-
-def _version_of(path: Path) -> tuple[int, int]:
-    """Return size and mtime of a given file. Raises UserError if it is not a plain file."""
-    if not path.is_file():
-        reason = "not a plain file" if path.exists() else "no such file"
-        raise UserError(f"--matte-model {path}: {reason}")
-    found = os.stat(path)
-    if found.st_size > MAX_MODEL:
-        raise UserError(f"--matte-model {path}: is over {MAX_MODEL >> 30} GB")
-    return found.st_size, found.st_mtime_ns
 
 
 def _fetched(address: str | None, fetch: bool, say: Callable[[str], None]) -> Path:

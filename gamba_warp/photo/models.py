@@ -40,9 +40,9 @@ class Published(NamedTuple):
     """
 
     name: str
-    sha256: str
     megabytes: int
-    licence: str
+    sha256: str
+    licence: str = "Apache 2.0"
 
     @property
     def address(self) -> str:
@@ -54,28 +54,12 @@ class Published(NamedTuple):
 PUBLISHED = (
     Published(
         "isnet-general-use",
-        "60920e99c45464f2ba57bee2ad08c919a52bbf852739e96947fbb4358c0d964a",
         179,
-        "Apache 2.0",
+        "60920e99c45464f2ba57bee2ad08c919a52bbf852739e96947fbb4358c0d964a",
     ),
-    Published(
-        "u2net",
-        "8d10d2f3bb75ae3b6d527c77944fc5e7dcd94b29809d47a739a7a728a912b491",
-        176,
-        "Apache 2.0",
-    ),
-    Published(
-        "silueta",
-        "75da6c8d2f8096ec743d071951be73b4a8bc7b3e51d9a6625d63644f90ffeedb",
-        44,
-        "Apache 2.0",
-    ),
-    Published(
-        "u2netp",
-        "309c8469258dda742793dce0ebea8e6dd393174f89934733ecc8b14c76f4ddd8",
-        5,
-        "Apache 2.0",
-    ),
+    Published("u2net", 176, "8d10d2f3bb75ae3b6d527c77944fc5e7dcd94b29809d47a739a7a728a912b491"),
+    Published("silueta", 44, "75da6c8d2f8096ec743d071951be73b4a8bc7b3e51d9a6625d63644f90ffeedb"),
+    Published("u2netp", 5, "309c8469258dda742793dce0ebea8e6dd393174f89934733ecc8b14c76f4ddd8"),
 )
 
 
@@ -106,11 +90,6 @@ def cached() -> Path | None:
 def may_fetch() -> bool:
     """Return True if network access is allowed: unless ``GAMBA_OFFLINE`` is set."""
     return os.environ.get("GAMBA_OFFLINE", "0") in ("", "0")
-
-
-def is_address(file: str | Path | None) -> bool:
-    """Return True for a URL, False for a file name."""
-    return str(file).startswith(("https://", "http://"))
 
 
 def published(address: str) -> Published | None:

@@ -14,7 +14,7 @@ import scipy.ndimage
 from numpy.typing import NDArray
 from skimage.measure import label
 
-from ..data.preprocess import without_specks
+from ..data.preprocess import border_of, without_specks
 
 ndimage: Any = scipy.ndimage  # its annotations do not say which results are arrays
 
@@ -77,7 +77,7 @@ def plain_matte(rgb: np.ndarray, keep_holes: bool = False) -> Plain | None:
     Returns:
         None if the background is not plain. An image of one colour is all background.
     """
-    edge = np.concatenate([rgb[0], rgb[-1], rgb[:, 0], rgb[:, -1]])
+    edge = border_of(rgb)
     color = np.median(edge, axis=0)
     if (np.abs(edge - color).max(-1) < _TOLERANCE).mean() < _FRACTION:
         return None
@@ -97,7 +97,7 @@ def plain_matte(rgb: np.ndarray, keep_holes: bool = False) -> Plain | None:
 def _outer(same: np.ndarray) -> tuple[np.ndarray, NDArray[np.bool_]]:
     """Return the numbered areas ``[H, W]`` of a mask, and those that touch the border."""
     areas = cast(np.ndarray, label(same, connectivity=1))
-    at_edge = np.unique(np.concatenate([areas[0], areas[-1], areas[:, 0], areas[:, -1]]))
+    at_edge = np.unique(border_of(areas))
     return areas, np.isin(areas, at_edge[at_edge > 0])
 
 

@@ -11,6 +11,7 @@ from torch import Tensor
 from ..batch import STAGES
 from ..errors import UserError
 from ..gaussians import Gaussians
+from ..untrusted.ranges import check_options
 from .density import level_set
 from .options import SurfaceOptions
 from .solid import distances, solid_of
@@ -63,7 +64,7 @@ def extract_surface(gaussians: Gaussians, options: SurfaceOptions, texture: int 
     """
     if options.method not in ("tsdf", "density"):
         raise ValueError(f"method is {options.method!r}, which has no surface")
-    options.check()
+    check_options(options)
     gaussians = near_and_visible(gaussians.detach())
     views = None
     STAGES.begin("mesh views")
@@ -77,15 +78,7 @@ def extract_surface(gaussians: Gaussians, options: SurfaceOptions, texture: int 
     else:
         mesh = level_set(gaussians, options.voxels, options.level)
     STAGES.begin("mesh cleaning")
-    vertices, faces = cleaned_mesh(
-        *mesh,
-        min_component=options.min_component,
-        min_diameter=options.min_diameter,
-        largest=options.largest,
-        close_holes=options.close_holes,
-        smooth=options.smooth,
-        max_faces=0 if options.watertight else options.faces,
-    )
+    vertices, faces = cleaned_mesh(*mesh, options)
     colors = image = moved = None
     if options.watertight:
         STAGES.begin("mesh closing")
@@ -171,28 +164,15 @@ def surface_of(
 
 
 def cleaned_mesh(
-    vertices: np.ndarray,
-    faces: np.ndarray,
-    *,
-    min_component: float = 0.0,
-    min_diameter: float = 0.0,
-    largest: bool = False,
-    close_holes: int = 0,
-    smooth: int = 0,
-    max_faces: int = 0,
+    vertices: np.ndarray, faces: np.ndarray, options: SurfaceOptions
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Remove duplicate and null faces of a mesh, then apply the options in order.
+    """Remove duplicate and null faces and small parts of a mesh, close holes, smooth and decimate.
 
     Args:
         vertices: ``[V, 3]``.
         faces: ``[F, 3]``, outside in front.
-        min_component: remove parts with a smaller fraction of all faces.
-        min_diameter: remove parts whose bounding box has a shorter diagonal, in units of the
-            whole's.
-        largest: keep only the part with the most faces.
-        close_holes: largest number of edges of holes to close; 0: none.
-        smooth: steps of Taubin smoothing, which hardly shrinks.
-        max_faces: target of quadric decimation, which keeps borders; 0: none.
+        options: ``min_component``, ``min_diameter``, ``largest``, ``close_holes``, ``smooth`` and
+            ``faces``. A surface that is closed later is decimated there.
 
     Returns:
         Vertices ``[V, 3]`` float64, all in use, and faces ``[F, 3]`` int64.
@@ -202,48 +182,39 @@ def cleaned_mesh(
     """
     # which has no stubs
     from pymeshlab import Mesh, MeshSet, PureValue  # pyright: ignore[reportAttributeAccessIssue]
+    from trimesh.graph import connected_component_labels, face_adjacency
 
     meshes = MeshSet()
     meshes.add_mesh(Mesh(vertices, faces.astype(np.int32)))
     meshes.meshing_remove_duplicate_vertices()
     meshes.meshing_remove_duplicate_faces()
     meshes.meshing_remove_null_faces()
-    least = int(min_component * meshes.current_mesh().face_number())
-    if largest:
-        parts = _part_sizes(meshes.current_mesh().face_matrix())
-        least = max(least, int(parts.max(initial=0)))
+    least = int(options.min_component * meshes.current_mesh().face_number())
+    if options.largest:
+        kept = meshes.current_mesh().face_matrix()  # of parts that are connected by edges
+        parts = connected_component_labels(face_adjacency(kept), node_count=len(kept))
+        least = max(least, int(np.bincount(parts).max(initial=0)))
     meshes.meshing_remove_connected_component_by_face_number(
         mincomponentsize=least, removeunref=True
     )
-    if min_diameter > 0:
-        shortest = min_diameter * meshes.current_mesh().bounding_box().diagonal()
+    if options.min_diameter > 0:
+        shortest = options.min_diameter * meshes.current_mesh().bounding_box().diagonal()
         meshes.meshing_remove_connected_component_by_diameter(
             mincomponentdiag=PureValue(shortest), removeunref=True
         )
     if meshes.current_mesh().face_number() == 0:
         raise UserError("no part of the surface is large enough")
-    if close_holes:
+    if options.close_holes:
         # Closing holes needs a manifold: the smallest faces at non-manifold edges are removed.
         meshes.meshing_repair_non_manifold_edges(method="Remove Faces")
         meshes.meshing_repair_non_manifold_vertices()
-        meshes.meshing_close_holes(maxholesize=close_holes, newfaceselected=False)
-    if smooth:
-        meshes.apply_coord_taubin_smoothing(stepsmoothnum=smooth)
-    if 0 < max_faces < meshes.current_mesh().face_number():
+        meshes.meshing_close_holes(maxholesize=options.close_holes, newfaceselected=False)
+    if options.smooth:  # Taubin's, which hardly shrinks
+        meshes.apply_coord_taubin_smoothing(stepsmoothnum=options.smooth)
+    if not options.watertight and 0 < options.faces < meshes.current_mesh().face_number():
         meshes.meshing_decimation_quadric_edge_collapse(
-            targetfacenum=max_faces, preserveboundary=True, preservenormal=True
+            targetfacenum=options.faces, preserveboundary=True, preservenormal=True
         )
         meshes.meshing_remove_unreferenced_vertices()
     kept = meshes.current_mesh()
     return kept.vertex_matrix(), kept.face_matrix().astype(np.int64)
-
-
-def _part_sizes(faces: np.ndarray) -> np.ndarray:
-    """Return the number of faces of each part, connected by edges."""
-    import trimesh
-    from scipy.sparse import coo_array
-    from scipy.sparse.csgraph import connected_components
-
-    pairs = np.asarray(trimesh.graph.face_adjacency(faces))
-    links = coo_array((np.ones(len(pairs), bool), pairs.T), shape=(len(faces),) * 2)
-    return np.bincount(connected_components(links, directed=False)[1])

@@ -7,7 +7,6 @@ from typing import Annotated, Literal
 
 from msgspec import Meta
 
-from ..untrusted.ranges import check_options
 from ..versions import require
 
 Method = Literal["tsdf", "density", "centers"]
@@ -72,14 +71,6 @@ class SurfaceOptions:
     faces: Faces = 0
     colors: bool = False
     watertight: bool = False
-
-    def check(self) -> None:
-        """Check the ranges of the numbers.
-
-        Raises:
-            UserError: a number is out of its range; the message names the option.
-        """
-        check_options(self)
 
     def require(self, texture: int = 0) -> None:
         """Check that the libraries are installed, before any work.

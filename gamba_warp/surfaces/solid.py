@@ -60,8 +60,8 @@ def solid_of(
         raise UserError(_EMPTY)
     # Only points near the surface need their distance; the walls of a filled cavity do not count.
     depth = np.where(filled, 1.0, -1.0)
-    beside = binary_dilation(filled, iterations=5) & ~binary_erosion(filled, iterations=5)
-    beside &= inside | ~filled
+    inner = np.asarray(binary_erosion(filled, iterations=5), bool)
+    beside = binary_dilation(filled, iterations=5) & ~inner & (inside | ~filled)
     distance = scene.compute_distance(points[beside.ravel()]).numpy() * voxels
     depth[beside] *= np.maximum(distance, _LEAST)
     corners, triangles, _, _ = marching_cubes(depth, 0.0, gradient_direction="ascent")

@@ -111,7 +111,10 @@ def _zip_members(archive: zipfile.ZipFile, source: Path) -> dict[str, zipfile.Zi
     if len(infos) > MAX_MEMBERS:
         raise UserError(f"{source}: {len(infos)} members, at most {MAX_MEMBERS} are supported")
     total = sum(info.file_size for info in infos)
-    _check_total(total, source.stat().st_size, source)
+    if total > MAX_BYTES:
+        raise UserError(f"{source}: unpacks to over {MAX_BYTES >> 30} GB")
+    if total > max(_SMALL, MAX_RATIO * source.stat().st_size):
+        raise UserError(f"{source}: unpacks to over {MAX_RATIO} times its size")
     found: dict[str, zipfile.ZipInfo] = {}
     folded: set[str] = set()
     for info in infos:
@@ -131,11 +134,3 @@ def _zip_members(archive: zipfile.ZipFile, source: Path) -> dict[str, zipfile.Zi
         folded.add(info.filename.casefold())
         found[info.filename] = info
     return found
-
-
-def _check_total(unpacked: int, packed: int, source: object) -> None:
-    """Raise if the unpacked size is too large, absolutely or for the packed size."""
-    if unpacked > MAX_BYTES:
-        raise UserError(f"{source}: unpacks to over {MAX_BYTES >> 30} GB")
-    if unpacked > max(_SMALL, MAX_RATIO * packed):
-        raise UserError(f"{source}: unpacks to over {MAX_RATIO} times its size")

@@ -56,32 +56,11 @@ def _parse(data: bytes, shape: tuple[int, ...]) -> np.ndarray:
     if tuple(stated) != shape:
         got = "x".join(map(str, stated))[:40] or "a single number"
         raise UserError(f"expected {wanted} numbers, its header states {got}")
-    array = plain_array(data[file.tell() :], dtype.str, shape, columns_first)
+    if not _NUMBERS.fullmatch(dtype.str):
+        raise UserError(f"it holds {dtype.str[:40]}, not numbers")
+    numbers = data[file.tell() :]
+    if len(numbers) != dtype.itemsize * math.prod(shape):
+        raise UserError(f"expected {wanted} numbers, it holds {len(numbers)} bytes of them")
+    array = np.ndarray(shape, dtype, numbers, order="F" if columns_first else "C")
     with np.errstate(over="ignore", invalid="ignore"):
         return array.astype(np.float64)
-
-
-def plain_array(data: bytes, dtype: str, shape: tuple[int, ...], columns_first: bool) -> np.ndarray:
-    """Make an array of numbers from bytes, with all arguments untrusted.
-
-    Args:
-        data: bytes of the array.
-        dtype: in numpy's notation: byte order, kind and bytes, ``<f4``.
-        shape: shape of the array.
-        columns_first: True if the first index runs fastest.
-
-    Returns:
-        Read-only array that shares the bytes.
-
-    Raises:
-        UserError: the type is not a plain integer or float, or the number of bytes does not match
-            the shape.
-    """
-    if not isinstance(dtype, str) or not _NUMBERS.fullmatch(dtype):
-        raise UserError(f"it holds {str(dtype)[:40]}, not numbers")
-    if not isinstance(data, bytes) or not all(type(n) is int and n >= 0 for n in shape):
-        raise UserError("its bytes or its shape have the wrong type")
-    if len(data) != int(dtype[2:]) * math.prod(shape):
-        stated = "x".join(map(str, shape))[:40]
-        raise UserError(f"expected {stated} numbers, it holds {len(data)} bytes of them")
-    return np.ndarray(shape, dtype, data, order="F" if columns_first else "C")

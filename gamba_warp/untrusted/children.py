@@ -23,7 +23,7 @@ from multiprocessing import get_context, parent_process
 from multiprocessing.connection import Connection, wait
 from typing import Any, NamedTuple
 
-from ..errors import UserError
+from ..errors import UserError, first_line
 from ..processes import end_with_parent
 
 _EXIT_SECONDS = 10.0  # timeout for the end of a killed process
@@ -213,7 +213,7 @@ def _run_task(folder: str, memory: int | None, data: bytes) -> bytes:
         reason = "not enough memory"
     except BaseException as error:
         reason = f"{type(error).__name__}: {error}"
-    return pickle.dumps((Failed((reason.strip().splitlines() or ["unknown"])[0]),))
+    return pickle.dumps((Failed(first_line(reason)),))
 
 
 def _limit(memory: int | None) -> None:

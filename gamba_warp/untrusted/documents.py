@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any, TypeVar, overload
+from typing import Any, TypeVar
 
 import msgspec
 
@@ -37,11 +37,7 @@ def read_bytes(path: str | Path, limit: int = MAX_BYTES) -> bytes:
     return data
 
 
-@overload
-def read_document(path: str | Path, kind: type[Kind], limit: int = MAX_BYTES) -> Kind: ...
-@overload
-def read_document(path: str | Path, kind: Any, limit: int = MAX_BYTES) -> Any: ...
-def read_document(path: str | Path, kind: Any, limit: int = MAX_BYTES) -> Any:
+def read_document(path: str | Path, kind: type[Kind], limit: int = MAX_BYTES) -> Kind:
     """Read a JSON file as a value of ``kind``.
 
     Args:
@@ -56,11 +52,7 @@ def read_document(path: str | Path, kind: Any, limit: int = MAX_BYTES) -> Any:
     return parse_document(read_bytes(path, limit), kind, str(path))
 
 
-@overload
-def parse_document(data: bytes | str, kind: type[Kind], source: str) -> Kind: ...
-@overload
-def parse_document(data: bytes | str, kind: Any, source: str) -> Any: ...
-def parse_document(data: bytes | str, kind: Any, source: str) -> Any:
+def parse_document(data: bytes | str, kind: type[Kind], source: str) -> Kind:
     """Decode JSON text as a value of ``kind``; NaN and infinity are not JSON and raise.
 
     Args:
@@ -85,11 +77,7 @@ def parse_document(data: bytes | str, kind: Any, source: str) -> Any:
         raise UserError(f"{source}: not valid JSON ({error})") from error
 
 
-@overload
-def read_lines(path: str | Path, kind: type[Kind]) -> Iterator[Kind]: ...
-@overload
-def read_lines(path: str | Path, kind: Any) -> Iterator[Any]: ...
-def read_lines(path: str | Path, kind: Any) -> Iterator[Any]:
+def read_lines(path: str | Path, kind: type[Kind]) -> Iterator[Kind]:
     """Yield the lines of a JSON Lines file, skipping those that ``parse_document`` rejects.
 
     A killed process may leave an incomplete line.
@@ -119,7 +107,7 @@ def read_lines(path: str | Path, kind: Any) -> Iterator[Any]:
 def value_of(text: str) -> Any:
     """Parse an option's text as JSON; return the text itself if it is not JSON."""
     try:
-        return parse_document(text, Any, "")
+        return parse_document(text, object, "")
     except UserError:
         return text
 

@@ -120,21 +120,18 @@ def check_values(values: Mapping[str, Any], owner: Callable, label: Callable[[st
     Raises:
         UserError: as for ``check_range``.
     """
-    ranges = _ranges(owner)
+    hints = _hints(owner)
     for name, value in values.items():
-        for limits in ranges.get(name, ()):
+        for limits in _limits(hints.get(name)):
             for item in value if isinstance(value, (list, tuple)) else [value]:
                 if isinstance(item, (int, float)) and not isinstance(item, bool):
                     check_range(label(name), item, limits)
 
 
 @functools.cache
-def _ranges(owner: Callable) -> dict[str, list[Meta]]:
-    """All ranges in the types of a dataclass's fields or a function's arguments, by name."""
-    return {
-        name: _limits(hint)
-        for name, hint in typing.get_type_hints(owner, include_extras=True).items()
-    }
+def _hints(owner: Callable) -> dict[str, Any]:
+    """Types of a dataclass's fields or a function's arguments, by name."""
+    return typing.get_type_hints(owner, include_extras=True)
 
 
 def _limits(hint: Any) -> list[Meta]:

@@ -9,7 +9,7 @@ import zipfile
 from pathlib import Path
 from typing import Any
 
-from ..errors import UserError
+from ..errors import UserError, first_line
 
 MAX_VALUES = 1_000_000  # in all lists and dictionaries; ours have some thousands
 MAX_DEPTH = 16  # levels of lists and dictionaries; ours have up to 6
@@ -60,9 +60,7 @@ def read_torch(path: str | Path, advice: str = "damaged, or not torch's") -> Any
         if refused:  # torch's message advises to run the file
             named = f"it holds {refused[1][:100]!r}, which torch does not load"
             raise UserError(f"{path}: {advice} ({named})") from error
-        lines = str(error).strip().splitlines()
-        reason = lines[0][:200] if lines else type(error).__name__
-        raise UserError(f"{path}: {advice} ({reason})") from error
+        raise UserError(f"{path}: {advice} ({first_line(error)[:200]})") from error
 
 
 def _check_zip(path: Path, size: int) -> None:

@@ -51,9 +51,8 @@ def own_frame(gaussians: Gaussians, name: str) -> Frame:
         UserError: the object has no extent.
     """
     opacities = gaussians.opacities.detach().cpu().numpy()
-    means = (
-        gaussians.means.detach().double().cpu().numpy()[opacities >= min(_VISIBLE, opacities.max())]
-    )
+    means = gaussians.means.detach().double().cpu().numpy()
+    means = means[opacities >= min(_VISIBLE, opacities.max())]
     low, high = np.percentile(means, [0.5, 99.5], axis=0)
     reach = 4 * float(gaussians.scales.detach().double().median())
     size = max(float((high - low).max()), reach)
@@ -93,11 +92,7 @@ def visible_order(gaussians: Gaussians, name: str) -> torch.Tensor:
             f"one object expected, got leading shape {tuple(gaussians.opacities.shape[:-1])}"
         )
     gaussians = gaussians.detach().to("cpu", torch.float32)
-    bad = torch.zeros(gaussians.num, dtype=torch.bool)
-    for value in gaussians.tensors().values():
-        bad |= ~value.reshape(gaussians.num, -1).isfinite().all(1)
-    if bad.any():
-        count = int(bad.sum())
+    if count := int((~gaussians.is_finite()).sum()):
         raise UserError(f"{name}: {count} of {gaussians.num} Gaussians are not finite")
     seen = gaussians.is_drawn().nonzero()[:, 0]
     if not len(seen):

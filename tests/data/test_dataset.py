@@ -281,7 +281,6 @@ def test_bad_requests(tmp_path):
     refused("no views", data.load, 0, views=[])
     refused("size 0", data.load, 0, size=0)
     refused("split 'tset'", open_dataset, tmp_path, "tset")
-    refused("layout 'x'", open_dataset, tmp_path, layout="x")
 
 
 @pytest.mark.parametrize("stated", [{"w": 40, "h": 30, "fl_x": 43.75, "cx": 20, "cy": 15}, {}])

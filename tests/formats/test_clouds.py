@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 from helpers.refusals import refused
 
-from gamba_warp.formats.ply_data import read_ply
+from gamba_warp.formats.headers import open_shape
+from gamba_warp.formats.ply_data import parse_ply
 from gamba_warp.formats.read import read
 from gamba_warp.versions import import_open3d
 
@@ -95,7 +96,8 @@ def test_lists_of_different_lengths(tmp_path, layout):
         rows = [struct.pack(f"{order}B{len(x)}if", len(x), *x, w) for x, w in faces]
         body = b"".join(rows) + struct.pack(f"{order}i", 7)
     (tmp_path / "a.ply").write_bytes(head + body)
-    data = read_ply(tmp_path / "a.ply").elements
+    with open_shape(tmp_path / "a.ply") as source:
+        data = parse_ply(source).elements
     assert data["edge"]["a"].tolist() == [7]
     assert data["face"]["weight"].tolist() == [1.5, 2.5, 3.5, 4.5]
     lists = data["face"]["vertex_indices"]

@@ -1,6 +1,7 @@
 """Gaussians of known shapes to surfaces."""
 
 import math
+from dataclasses import replace
 
 import manifold3d
 import numpy as np
@@ -31,6 +32,7 @@ from gamba_warp.surfaces.texture import Texture
 from gamba_warp.surfaces.tsdf import CLEAR, Views, fuse, look_around, sphere_cameras
 from gamba_warp.versions import import_open3d
 
+UNCHANGED = SurfaceOptions(min_component=0, close_holes=0)  # of a mesh that is cleaned
 QUICK = dict(voxels=64, views=24, pixels=128)
 
 
@@ -172,8 +174,8 @@ def ball_with_speck():
 )
 def test_floaters_go(options):
     ball, both = ball_with_speck()
-    assert len(cleaned_mesh(both.vertices, both.faces)[1]) == len(both.faces)
-    vertices, faces = cleaned_mesh(both.vertices, both.faces, **options)
+    assert len(cleaned_mesh(both.vertices, both.faces, UNCHANGED)[1]) == len(both.faces)
+    vertices, faces = cleaned_mesh(both.vertices, both.faces, replace(UNCHANGED, **options))
     assert len(faces) == len(ball.faces) and np.linalg.norm(vertices, axis=1).max() < 0.41
 
 
@@ -183,7 +185,7 @@ def test_holes_up_to_a_size_are_closed():
     small = ball.faces[~(ball.faces == 5).any(1)]  # a ring of five or six edges
     large = ball.faces[~np.isin(ball.faces, around).any(1)]
     for faces, closed in ((small, True), (large, False)):
-        vertices, faces = cleaned_mesh(ball.vertices, faces, close_holes=6)
+        vertices, faces = cleaned_mesh(ball.vertices, faces, replace(UNCHANGED, close_holes=6))
         mesh = trimesh.Trimesh(vertices, faces, process=False)
         assert mesh.is_watertight == closed
         assert not closed or abs(mesh.volume - ball.volume) < 0.01 * ball.volume
@@ -191,7 +193,7 @@ def test_holes_up_to_a_size_are_closed():
 
 def test_decimation():
     ball = trimesh.creation.icosphere(4, 0.4)
-    vertices, faces = cleaned_mesh(ball.vertices, ball.faces, max_faces=500)
+    vertices, faces = cleaned_mesh(ball.vertices, ball.faces, replace(UNCHANGED, faces=500))
     assert 450 < len(faces) <= 500 and len(np.unique(faces)) == len(vertices)
     assert np.abs(np.linalg.norm(vertices, axis=1) - 0.4).max() < 0.01
     mesh = trimesh.Trimesh(vertices, faces, process=False)
@@ -201,13 +203,13 @@ def test_decimation():
 def test_smoothing_flattens_and_keeps_the_size():
     ball = trimesh.creation.icosphere(4, 0.4)
     noise = np.random.default_rng(0).normal(0, 0.003, ball.vertices.shape)
-    vertices, _ = cleaned_mesh(ball.vertices + noise, ball.faces, smooth=10)
+    vertices, _ = cleaned_mesh(ball.vertices + noise, ball.faces, replace(UNCHANGED, smooth=10))
     radii = np.linalg.norm(vertices, axis=1)
     assert radii.std() < 0.0015 and abs(radii.mean() - 0.4) < 0.001
 
 
 def test_a_clean_mesh_of_nothing():
-    refused("no part", cleaned_mesh, np.zeros((3, 3)), np.array([[0, 1, 2]]))
+    refused("no part", cleaned_mesh, np.zeros((3, 3)), np.array([[0, 1, 2]]), UNCHANGED)
 
 
 @pytest.mark.parametrize("method", ["tsdf", "density"])

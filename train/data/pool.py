@@ -1,4 +1,4 @@
-"""Made objects for training: other processes make and render them while the model trains.
+"""Procedural objects for training: other processes make and render them while the model trains.
 
 The pool has ``SLOTS`` slots. A round takes one sample from each slot, in its own order, and an
 object stays in its slot for ``USES`` rounds. The slots change their objects at staggered rounds, so
@@ -18,7 +18,7 @@ import numpy as np
 import torch
 
 from gamba_warp.data.dataset import ViewDataset
-from gamba_warp.data.layouts import DecodedImage, ObjectFiles
+from gamba_warp.data.layouts import MemoryImage, ObjectFiles
 from gamba_warp.devices import quiet_warp
 from gamba_warp.errors import UserError
 from gamba_warp.untrusted.children import Failed, end_idle, run_each
@@ -51,7 +51,7 @@ class PoolOptions:
 
 
 class Pool:
-    """Made objects by sample number; threads may take them in roughly that order."""
+    """Procedural objects by sample number; threads may take them in roughly that order."""
 
     def __init__(self, options: PoolOptions, first: int) -> None:
         """Start making the objects of the samples from ``first`` on.
@@ -89,7 +89,8 @@ class Pool:
                 self._untaken.remove(number)
                 oldest = sample // SLOTS - 1  # other threads may still be in the round before
                 for old in self._ready.keys() - self._untaken:
-                    if self._last_round(old) < oldest:
+                    generation, slot = divmod(old // self.options.world, SLOTS)
+                    if (generation + 1) * USES - slot % USES - 1 < oldest:  # its last round
                         del self._ready[old]
                 self._changed.notify_all()
             return self._ready[number]
@@ -108,11 +109,6 @@ class Pool:
         slot = int(_order(self.options.seed, round_number)[position])
         generation = (round_number + slot % USES) // USES
         return (generation * SLOTS + slot) * self.options.world + self.options.rank
-
-    def _last_round(self, number: int) -> int:
-        """Last round that uses an object."""
-        generation, slot = divmod(number // self.options.world, SLOTS)
-        return (generation + 1) * USES - slot % USES - 1
 
     def _needed(self) -> Iterator[int]:
         """Yield the numbers of all objects, each once, in the order of first use."""
@@ -172,24 +168,14 @@ def _make_views(number: int, seed: int, settings: Settings) -> Views:
     return draw_views(make_object(np.random.default_rng([seed, number])), str(number), settings)
 
 
-class _Image(DecodedImage):
-    """Image in memory."""
-
-    def __init__(self, values: np.ndarray) -> None:
-        self.values = values
-
-    def read(self) -> np.ndarray:
-        return self.values
-
-
 def _files(views: Views, uid: str) -> ObjectFiles:
     number, size = views.images.shape[:2]
     near, far = (
-        None if steps is None else [_Image(each.astype(np.float32)) for each in steps]
+        None if steps is None else [MemoryImage(uid, each.astype(np.float32)) for each in steps]
         for steps in (views.depths, views.backs)
     )
     return ObjectFiles(
-        images=[_Image(image) for image in views.images],
+        images=[MemoryImage(uid, image) for image in views.images],
         camera_to_world=views.poses,
         Ks=np.broadcast_to(views.K, (number, 3, 3)),
         sizes=[(size, size)] * number,

@@ -125,11 +125,8 @@ def _texel(s: _Surface, start: wp.int64, width: wp.int32, height: wp.int32, x: i
         row += height
     value = s.texels[start + wp.int64(row) * wp.int64(width) + wp.int64(column)]
     alpha = wp.float32(value[3]) / 255.0
-    red, green, blue = (
-        s.linear[wp.int32(value[0])],
-        s.linear[wp.int32(value[1])],
-        s.linear[wp.int32(value[2])],
-    )
+    red, green = s.linear[wp.int32(value[0])], s.linear[wp.int32(value[1])]
+    blue = s.linear[wp.int32(value[2])]
     return wp.vec4(alpha * red, alpha * green, alpha * blue, alpha)
 
 
@@ -253,14 +250,9 @@ class RayCaster:
     """
 
     def __init__(self, mesh: TexturedMesh, lights: Lights, threads: int = 1) -> None:
-        self._o3d = import_open3d()
         self.mesh, self.lights, self.threads = mesh, lights, threads
-        core = self._o3d.core
-        self._scene = self._o3d.t.geometry.RaycastingScene(nthreads=threads)
-        self._scene.add_triangles(
-            core.Tensor(mesh.vertices.astype(np.float32)),
-            core.Tensor(mesh.faces.astype(np.uint32)),
-        )
+        self._scene = import_open3d().t.geometry.RaycastingScene(nthreads=threads)
+        self._scene.add_triangles(mesh.vertices.astype(np.float32), mesh.faces.astype(np.uint32))
         corners = mesh.vertices[mesh.faces]
         edges = corners[:, 1:] - corners[:, :1]
         normal = np.cross(edges[:, 0], edges[:, 1])
@@ -350,7 +342,7 @@ class RayCaster:
         corners = (self.mesh.vertices - pose[:3, 3]) @ pose[:3, 2]
         far = max(0.0, float(-corners.min())) + 1.0  # behind all of the mesh
         rays = np.concatenate([origin + far * directions, -directions], 1).astype(np.float32)
-        hits = self._scene.cast_rays(self._o3d.core.Tensor(rays), nthreads=self.threads)
+        hits = self._scene.cast_rays(rays, nthreads=self.threads)
         depth = far - hits["t_hit"].numpy()  # negative behind the camera or without a hit
         return np.maximum(depth, 0).reshape(size, size).astype(np.float32)
 
@@ -381,7 +373,7 @@ class RayCaster:
         outputs = [_array(travelled, wp.float32), _array(color, wp.vec4), _array(depth, wp.float32)]
         rays = np.concatenate([np.broadcast_to(origin, directions.shape), directions], 1)
         for _ in range(LAYERS):
-            hits = self._scene.cast_rays(self._o3d.core.Tensor(rays), nthreads=self.threads)
+            hits = self._scene.cast_rays(rays, nthreads=self.threads)
             parts = hits["t_hit"], hits["primitive_ids"], hits["primitive_uvs"]
             distances, faces, corners = (part.numpy() for part in parts)
             operands = [

@@ -234,9 +234,7 @@ def render_meshes(
     for index, result in progress_bar(found, total=len(meshes), unit="object"):
         mesh = meshes[index]
         if isinstance(result, Failed):
-            failures[mesh.uid] = f"{mesh.path}: {result.reason}"
-        elif isinstance(result, str):
-            failures[mesh.uid] = result
+            failures[mesh.uid] = f"{mesh.path}: {result.reason.removeprefix(f'{mesh.path}: ')}"
         elif result:
             warnings[mesh.uid] = result
     stored = {}
@@ -248,15 +246,8 @@ def render_meshes(
     return warnings, failures
 
 
-def _attempt(mesh: Mesh, out: Path, settings: Settings, threads: int) -> list[str] | str:
-    """Render in a child process; return the mesh's warnings, or the reason of the failure."""
+def _attempt(mesh: Mesh, out: Path, settings: Settings, threads: int) -> list[str]:
+    """Render in a child process; return the mesh's warnings."""
     quiet_warp()
     torch.set_num_threads(threads)
-    try:
-        return render_object(mesh, out, settings)
-    except UserError as error:
-        return str(error)
-    except MemoryError:
-        return f"{mesh.path}: not enough memory"
-    except Exception as error:  # one odd file must not stop the others
-        return f"{mesh.path}: {type(error).__name__}: {error}"
+    return render_object(mesh, out, settings)

@@ -26,7 +26,7 @@ from msgspec import Meta
 
 from gamba_warp.data.dataset import ViewDataset
 from gamba_warp.data.gso import scanned
-from gamba_warp.data.layouts import EncodedImage, ObjectFiles, object_of
+from gamba_warp.data.layouts import MemoryImage, ObjectFiles, object_of
 from gamba_warp.errors import FileWarning, UserError, first_line
 from gamba_warp.untrusted.documents import MAX_BYTES, parse_document, read_bytes
 
@@ -166,9 +166,9 @@ def _read_object(sample: dict[str, Any], uid: str) -> ObjectFiles:
         raise UserError(f"{source}: one of Google Scanned Objects, which are for evaluation")
     contents = {name: value for name, value in sample.items() if isinstance(value, bytes)}
     document = parse_document(contents.pop("json", b""), object, source)
-    images = {name: EncodedImage(f"{source}.{name}", c) for name, c in contents.items()}
+    images = {name: MemoryImage(f"{source}.{name}", c) for name, c in contents.items()}
 
-    def find(name: object, where: str) -> EncodedImage:
+    def find(name: object, where: str) -> MemoryImage:
         if not isinstance(name, str) or name not in images:
             raise UserError(f"{where}: the shard has no {repr(name)[:80]} of this object")
         contents.pop(name, None)

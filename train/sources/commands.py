@@ -1,4 +1,4 @@
-"""Commands ``gamba data furniture``, ``made``, ``render`` and the others.
+"""Commands ``gamba data furniture``, ``procedural``, ``render`` and the others.
 
 They parse, call and print. Existing results are skipped, so a stopped command can be continued.
 Failures are printed to stderr, and the exit code is then 1.
@@ -46,18 +46,13 @@ class Selection:
     shard: str = "0/1"
     limit: Annotated[int, Meta(ge=1, le=10**9)] | None = None
 
-    @property
-    def numbers(self) -> tuple[int, int]:
-        """Numbers i and n of the shard.
+    def of(self, items: Sequence[Item]) -> Sequence[Item]:
+        """Select from the items.
 
         Raises:
             UserError: the shard is not of the form i/n with 0 <= i < n.
         """
-        return shard_numbers(self.shard)
-
-    def of(self, items: Sequence[Item]) -> Sequence[Item]:
-        """Select from the items."""
-        first, count = self.numbers
+        first, count = shard_numbers(self.shard)
         return items[first::count][: self.limit]
 
 

@@ -13,13 +13,6 @@ from ...kernels.causal_conv1d import causal_conv1d_fn as _causal_conv1d_fn
 from ...kernels.causal_conv1d.reference import causal_conv1d_reference
 from ..shared import DTYPES, INDEX_DTYPES, check_tensor, of_rows, one_of
 
-__all__ = [
-    "causal_conv1d_fn",
-    "causal_conv1d_ref",
-    "causal_conv1d_update",
-    "causal_conv1d_update_ref",
-]
-
 ACTIVATIONS = (None, "silu", "swish")
 
 

@@ -8,8 +8,6 @@ from torch import Tensor
 from ...kernels.causal_conv1d.api import last_tokens
 from ...kernels.runtime.packed import sequences
 
-__all__ = ["causal_conv1d_varlen_states", "causal_conv1d_varlen_states_ref"]
-
 
 @torch.no_grad()
 def causal_conv1d_varlen_states(x: Tensor, cu_seqlens: Tensor, state_len: int) -> Tensor:

@@ -11,16 +11,9 @@ from torch import Tensor
 
 @torch.no_grad()
 def adam(
-    param: Tensor,
-    param_grad: Tensor,
-    exp_avg: Tensor,
-    exp_avg_sq: Tensor,
-    valid: Tensor | None,
-    lr: float,
-    b1: float,
-    b2: float,
-    eps: float,
-) -> None:
+    param: Tensor, param_grad: Tensor, exp_avg: Tensor, exp_avg_sq: Tensor, valid: Tensor | None,
+    lr: float, b1: float, b2: float, eps: float,
+) -> None:  # fmt: skip
     """Update rows of a parameter and of its averages in place, by Adam without bias correction.
 
     Args:
@@ -70,10 +63,6 @@ class SelectiveAdam(torch.optim.Adam):
                 state = self.state[param]
                 if not state:
                     state["step"] = torch.tensor(0.0)
-                    state["exp_avg"], state["exp_avg_sq"] = (
-                        torch.zeros_like(param) for _ in range(2)
-                    )
-                mean, square = state["exp_avg"], state["exp_avg_sq"]
-                b1, b2 = group["betas"]
-                options = {"lr": group["lr"], "b1": b1, "b2": b2, "eps": group["eps"]}
-                adam(param, param.grad, mean, square, visibility, **options)
+                    state |= {k: torch.zeros_like(param) for k in ("exp_avg", "exp_avg_sq")}
+                averages, (b1, b2) = (state["exp_avg"], state["exp_avg_sq"]), group["betas"]
+                adam(param, param.grad, *averages, visibility, group["lr"], b1, b2, group["eps"])

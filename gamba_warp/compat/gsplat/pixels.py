@@ -39,19 +39,11 @@ def pair_ids(images: Tensor, tiles: Tensor, depths: Tensor, count: int) -> Tenso
 
 @torch.no_grad()
 def isect_tiles(
-    means2d: Tensor,
-    radii: Tensor,
-    depths: Tensor,
-    tile_size: int,
-    tile_width: int,
-    tile_height: int,
-    sort: bool = True,
-    segmented: bool = False,
-    packed: bool = False,
-    n_images: int | None = None,
-    image_ids: Tensor | None = None,
+    means2d: Tensor, radii: Tensor, depths: Tensor, tile_size: int, tile_width: int,
+    tile_height: int, sort: bool = True, segmented: bool = False, packed: bool = False,
+    n_images: int | None = None, image_ids: Tensor | None = None,
     gaussian_ids: Tensor | None = None,
-) -> tuple[Tensor, Tensor, Tensor]:
+) -> tuple[Tensor, Tensor, Tensor]:  # fmt: skip
     """Find pairs of tiles and Gaussians whose boxes overlap.
 
     Args:
@@ -171,20 +163,11 @@ def blend(
 
 
 def rasterize_to_pixels(
-    means2d: Tensor,
-    conics: Tensor,
-    colors: Tensor,
-    opacities: Tensor,
-    image_width: int,
-    image_height: int,
-    tile_size: int,
-    isect_offsets: Tensor,
-    flatten_ids: Tensor,
-    backgrounds: Tensor | None = None,
-    masks: Tensor | None = None,
-    packed: bool = False,
+    means2d: Tensor, conics: Tensor, colors: Tensor, opacities: Tensor, image_width: int,
+    image_height: int, tile_size: int, isect_offsets: Tensor, flatten_ids: Tensor,
+    backgrounds: Tensor | None = None, masks: Tensor | None = None, packed: bool = False,
     absgrad: bool = False,
-) -> tuple[Tensor, Tensor]:
+) -> tuple[Tensor, Tensor]:  # fmt: skip
     """Composite the Gaussians of given lists, front to back; differentiable in all but the lists.
 
     Args:

@@ -138,13 +138,9 @@ def world_to_cam(means: Tensor, covars: Tensor, viewmats: Tensor) -> tuple[Tenso
 
 
 def proj(
-    means: Tensor,
-    covars: Tensor,
-    Ks: Tensor,
-    width: int,
-    height: int,
+    means: Tensor, covars: Tensor, Ks: Tensor, width: int, height: int,
     camera_model: str = "pinhole",
-) -> tuple[Tensor, Tensor]:
+) -> tuple[Tensor, Tensor]:  # fmt: skip
     """Project means and covariances from camera frames to the image (EWA, pinhole).
 
     Args:
@@ -267,24 +263,12 @@ def _project_covariances(
 
 
 def fully_fused_projection(
-    means: Tensor,
-    covars: Tensor | None,
-    quats: Tensor | None,
-    scales: Tensor | None,
-    viewmats: Tensor,
-    Ks: Tensor,
-    width: int,
-    height: int,
-    eps2d: float = EPS2D,
-    near_plane: float = 0.01,
-    far_plane: float = 1e10,
-    radius_clip: float = 0.0,
-    packed: bool = False,
-    sparse_grad: bool = False,
-    calc_compensations: bool = False,
-    camera_model: str = "pinhole",
-    opacities: Tensor | None = None,
-) -> tuple[Tensor | None, ...]:
+    means: Tensor, covars: Tensor | None, quats: Tensor | None, scales: Tensor | None,
+    viewmats: Tensor, Ks: Tensor, width: int, height: int, eps2d: float = EPS2D,
+    near_plane: float = 0.01, far_plane: float = 1e10, radius_clip: float = 0.0,
+    packed: bool = False, sparse_grad: bool = False, calc_compensations: bool = False,
+    camera_model: str = "pinhole", opacities: Tensor | None = None,
+) -> tuple[Tensor | None, ...]:  # fmt: skip
     """Project Gaussians into each view; differentiable in means, covars, quats, scales, viewmats.
 
     Args:

@@ -25,12 +25,9 @@ def quat_to_rotmat(quats: Tensor) -> Tensor:
 
 
 def quat_scale_to_covar_preci(
-    quats: Tensor,
-    scales: Tensor,
-    compute_covar: bool = True,
-    compute_preci: bool = True,
+    quats: Tensor, scales: Tensor, compute_covar: bool = True, compute_preci: bool = True,
     triu: bool = False,
-) -> tuple[Tensor | None, Tensor | None]:
+) -> tuple[Tensor | None, Tensor | None]:  # fmt: skip
     """Convert rotations and standard deviations to covariances and their inverses.
 
     Args:
@@ -61,12 +58,8 @@ def quat_scale_to_covar_preci(
 
 
 def compute_relocation(
-    opacities: Tensor,
-    scales: Tensor,
-    ratios: Tensor,
-    binoms: Tensor,
-    min_opacity: float = 0.0,
-) -> tuple[Tensor, Tensor]:
+    opacities: Tensor, scales: Tensor, ratios: Tensor, binoms: Tensor, min_opacity: float = 0.0,
+) -> tuple[Tensor, Tensor]:  # fmt: skip
     """Compute opacity and size of n equal Gaussians at one place that look like a single one.
 
     ``o' = 1 - (1 - o)^(1/n)`` and

@@ -52,15 +52,13 @@ def export_arrays(
     gaussians = gaussians.detach().to("cpu", torch.float32)
     if axes == "opengl":
         gaussians = flip_axes(gaussians)
+    if count := int((~gaussians.is_finite()).sum()):
+        raise UserError(f"{path}: not written, {count} of {gaussians.num} Gaussians are not finite")
     if gaussians.quats is None:
         gaussians.quats = torch.tensor([1.0, 0.0, 0.0, 0.0]).expand(gaussians.num, 4)
     if gaussians.harmonics is None:
         gaussians.harmonics = torch.zeros(gaussians.num, 0, 3)
     arrays = {name: getattr(gaussians, name).numpy() for name in (*_NAMES, "harmonics")}
-    if not all(np.isfinite(value).all() for value in arrays.values()):
-        finite = [np.isfinite(x.reshape(gaussians.num, -1)).all(1) for x in arrays.values()]
-        count = np.count_nonzero(~np.all(finite, axis=0))
-        raise UserError(f"{path}: not written, {count} of {gaussians.num} Gaussians are not finite")
     lengths = np.linalg.norm(arrays["quats"], axis=1, keepdims=True)
     arrays["quats"] = arrays["quats"] / lengths.clip(1e-12)
     return arrays

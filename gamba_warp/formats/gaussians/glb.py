@@ -24,12 +24,6 @@ POINTS = 0
 _STRAIGHT = 1e-4  # largest deviation of a node's matrix from a rotation times a number
 
 
-def harmonic_names(degree: int) -> list[str]:
-    """Names of the attributes of the harmonics of degrees 1 to ``degree``, in their order."""
-    pairs = [(l, n) for l in range(1, degree + 1) for n in range(2 * l + 1)]
-    return [f"{EXTENSION}:SH_DEGREE_{l}_COEF_{n}" for l, n in pairs]
-
-
 def has_gaussians(file: GltfFile) -> bool:
     """Return True if a primitive has the extension. Raises UserError if the file is malformed."""
     return any(_splats(mesh) for mesh in file.document.entries("meshes"))
@@ -99,7 +93,11 @@ def _primitive(file: GltfFile, primitive: Entry, left_out: list[str] | None) -> 
         "opacities": read(f"{EXTENSION}:OPACITY", 1)[:, 0],
         "colors": read(f"{EXTENSION}:SH_DEGREE_0_COEF_0", 3) * SH_C0 + 0.5,
     }
-    harmonics = [read(name, 3) for name in harmonic_names(degree)]
+    harmonics = [
+        read(f"{EXTENSION}:SH_DEGREE_{l}_COEF_{n}", 3)
+        for l in range(1, degree + 1)
+        for n in range(2 * l + 1)
+    ]
     counts = {name: len(value) for name, value in arrays.items()}
     counts |= {f"coefficient {i}": len(value) for i, value in enumerate(harmonics)}
     if len(set(counts.values())) > 1:

@@ -56,7 +56,6 @@ def read_splat(source: Source, left_out: list[str] | None = None) -> Gaussians:
         UserError: the file is not of whole records, or its values are invalid.
     """
     path, file, size = source
-    source.check()
     if size % RECORD.itemsize:
         raise UserError(
             f"{path}: truncated or not a .splat file, {size} bytes are not a multiple of "

@@ -100,7 +100,6 @@ def read_spz(source: Source, left_out: list[str] | None = None) -> Gaussians:
             it states, or its values are invalid; or version 4 without a module for ZSTD.
     """
     path = source.path
-    source.check()
     found = unpacked(path, source.file.read())
     start, columns = 0, []
     for size in found.widths:

@@ -44,7 +44,6 @@ class Unpacked:
     body: bytes | bytearray
     version: int
     count: int
-    degree: int
     bits: int
     antialiased: bool
     widths: list[int]  # bytes of a Gaussian, of each kind
@@ -60,8 +59,8 @@ def unpacked(path: Path, content: bytes) -> Unpacked:
     return (_from_streams if content.startswith(MAGIC) else _from_gzip)(path, content)
 
 
-def _sizes(path: Path, header: bytes, packed: int) -> tuple[list[int], Unpacked]:
-    """Return the bytes of each kind of numbers by a header, and the header's values.
+def _header(path: Path, header: bytes, packed: int) -> Unpacked:
+    """Return the values of a header, without the numbers themselves.
 
     The ``packed`` bytes of the file cannot hold more than ``_MAX_RATIO`` times as many.
     """
@@ -74,9 +73,7 @@ def _sizes(path: Path, header: bytes, packed: int) -> tuple[list[int], Unpacked]
     each = [position, 1, 3, 3, rotation, *([3 * COUNTS[degree]] if degree else [])]
     says = f"{count} Gaussians"
     compare_sizes(path, says, count * sum(each), _MAX_RATIO * packed, exact=False)
-    return [count * size for size in each], Unpacked(
-        b"", version, count, degree, bits, bool(flags & ANTIALIASED), each
-    )
+    return Unpacked(b"", version, count, bits, bool(flags & ANTIALIASED), each)
 
 
 def _from_gzip(path: Path, content: bytes) -> Unpacked:
@@ -88,8 +85,8 @@ def _from_gzip(path: Path, content: bytes) -> Unpacked:
         _, version, count, _, _, flags, _ = HEADER.unpack(head)
         if version not in (1, 2, 3):
             raise UserError(f"{path}: .spz of version {version}, in gzip only 1 to 3 are supported")
-        sizes, found = _sizes(path, head, len(content))
-        wanted = sum(sizes)
+        found = _header(path, head, len(content))
+        wanted = count * sum(found.widths)
         body = stream.read(wanted + 1)
         records = body[wanted:]
         if flags & _MORE and records:
@@ -112,7 +109,8 @@ def _from_streams(path: Path, content: bytes) -> Unpacked:
     (table,) = _PLAIN.unpack_from(content, HEADER.size)
     if version != 4:
         raise UserError(f"{path}: .spz of version {version}, without gzip only 4 is supported")
-    sizes, found = _sizes(path, content[: HEADER.size], len(content))
+    found = _header(path, content[: HEADER.size], len(content))
+    sizes = [found.count * width for width in found.widths]
     if streams != len(sizes) or table < start:
         raise UserError(f"{path}: broken header, {streams} streams, their table at byte {table}")
     at = table + streams * _ENTRY.size

@@ -31,13 +31,7 @@ def create_block(
     one_of("ssm_cfg['layer']", options.pop("layer"), "Mamba1")
     mixer = partial(Mamba, layer_idx=layer_idx, **options, **at)
     norm = partial(RMSNorm if rms_norm else nn.LayerNorm, eps=norm_epsilon, **at)
-    block = Block(
-        d_model,
-        mixer,
-        norm_cls=norm,
-        fused_add_norm=fused_add_norm,
-        residual_in_fp32=residual_in_fp32,
-    )
+    block = Block(d_model, mixer, nn.Identity, norm, fused_add_norm, residual_in_fp32)
     block.layer_idx = layer_idx
     return block
 

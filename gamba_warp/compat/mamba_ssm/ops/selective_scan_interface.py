@@ -13,16 +13,6 @@ from ....kernels.selective_scan.api import input_matrix
 from ....kernels.selective_scan.reference import selective_scan_reference
 from ...shared import check_tensor, one_of
 
-__all__ = [
-    "bimamba_inner_fn",
-    "bimamba_inner_ref",
-    "mamba_inner_fn",
-    "mamba_inner_fn_no_out_proj",
-    "mamba_inner_ref",
-    "selective_scan_fn",
-    "selective_scan_ref",
-]
-
 
 def selective_scan_ref(
     u: Tensor, delta: Tensor, A: Tensor, B: Tensor, C: Tensor, D: Tensor | None = None,

@@ -100,13 +100,6 @@ class RMSNorm(nn.Module):
     ) -> Any:
         """Normalize ``x [.., D]`` plus a residual, as ``layer_norm_fn``."""
         dropout_p = self.drop.p if self.drop is not None and self.training else 0.0
-        return rms_norm_fn(
-            x,
-            self.weight,
-            None,
-            residual=residual,
-            eps=self.eps,
-            dropout_p=dropout_p,
-            prenorm=prenorm,
-            residual_in_fp32=residual_in_fp32,
-        )
+        options = {"eps": self.eps, "dropout_p": dropout_p, "prenorm": prenorm}
+        options["residual_in_fp32"] = residual_in_fp32
+        return rms_norm_fn(x, self.weight, None, residual, **options)
