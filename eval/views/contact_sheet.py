@@ -78,7 +78,9 @@ def contact_sheet(path: Path, rows: list[Row]) -> None:
     starts = [_LABEL, _LABEL + step + 2 * _GAP, _LABEL + step + 4 * _GAP + most * step]
     sheet = Image.new("RGB", (starts[2] + most * step, _HEADER + len(rows) * step), (255, 255, 255))
     draw, font = ImageDraw.Draw(sheet), ImageFont.load_default()
-    for start, title in zip(starts, ("input", "ground truth", "prediction") if most else ("input",)):
+    for start, title in zip(
+        starts, ("input", "ground truth", "prediction") if most else ("input",)
+    ):
         draw.text((start, 4), title, fill=(0, 0, 0), font=font)
     for number, row in enumerate(rows):
         top = _HEADER + number * step
