@@ -153,7 +153,7 @@ def shape_iou(
         return {"iou": None, "iou_reason": "neither shape fills a voxel", "iou_voxel": grid.step}
     from scipy.ndimage import binary_erosion
 
-    edges = sum(np.count_nonzero(x & ~binary_erosion(x)) for x in filled)
+    edges = sum(np.count_nonzero(x & ~np.asarray(binary_erosion(x))) for x in filled)
     error = min(1.0, edges / max(1, np.count_nonzero(filled[0] | filled[1])) / 2)
     return {"iou": iou, "iou_error": error, "iou_voxel": grid.step}
 

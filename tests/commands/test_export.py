@@ -95,7 +95,7 @@ def test_formats_of_gaussians(ball, tmp_path, capsys):
     assert (out / "egg.splat").stat().st_size == 32 * 2500
     image = np.array(Image.open(out / "egg.gif").convert("RGB"))
     assert (image < 250).any(-1).mean() > 0.1  # it is in the image, wherever it was
-    assert "<script" in (out / "egg.html").read_text()
+    assert "<iframe" in (out / "egg.html").read_text()
     assert "2,500 Gaussians" in capsys.readouterr().out
 
 

@@ -1,5 +1,6 @@
 """--elevation, --fov and --distance of reconstruct, export and view."""
 
+import html
 import json
 import math
 import re
@@ -28,7 +29,7 @@ def first_frame(path):
 
 
 def camera_of(page):
-    home = json.loads(re.search(r'"home": (\{[^}]*\})', page)[1])
+    home = json.loads(re.search(r'"home": (\{[^}]*\})', html.unescape(page))[1])
     return home["distance"], home["fov"], pytest.approx(math.degrees(home["elevation"]))
 
 
