@@ -8,7 +8,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from ....kernels.causal_conv1d import causal_conv1d_fn
-from ....kernels.selective_scan import selective_scan_fn
+from ....kernels.selective_scan import selective_scan_fn as selective_scan_fn
 from ....kernels.selective_scan.api import input_matrix
 from ....kernels.selective_scan.reference import selective_scan_reference
 from ...shared import check_tensor, one_of
