@@ -52,7 +52,7 @@ RECIPES: dict[RecipeName, Recipe] = {
     ),
     "rays": Recipe(
         about="the shipped model's network in one run of about 5 hours of one CPU core (by the "
-        "speed of run 24, docs/lab/rays.md); its result is not measured, what ships had 39 hours",
+        "speed of run 24, docs/lab/rays.md); its result is not measured, what ships had 41 hours",
         settings={
             "--preset rays": "starter/rays.json: 128² input, Gaussians on the pixels' rays",
             "--size 128": "all runs",
