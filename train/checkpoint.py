@@ -27,7 +27,14 @@ from gamba_warp.untrusted.names import plain_name
 from gamba_warp.untrusted.torch_files import read_torch
 
 from .batches import TrainingData
-from .config import STEP_SIZE, DataConfig, LengthConfig, TrainConfig, config_differences
+from .config import (
+    STEP_SIZE,
+    DataConfig,
+    LengthConfig,
+    TrainConfig,
+    config_differences,
+    renamed,
+)
 from .ddp import World
 from .optim import Ema, NewLength, Schedule, build_optimizer, checked_moments
 
@@ -358,29 +365,13 @@ def read_state(checkpoint: Path) -> dict[str, Any]:
     return state
 
 
-# Names in checkpoints of earlier versions, by group of the options.
-_RENAMED = {
-    "views": {
-        "made": "procedural",
-        "front_share": "front_fraction",
-        "mirror": "flip",
-        "recolor": "color_jitter",
-    },
-    "optim": {"decay_share": "decay_fraction"},
-    "run": {"recompute": "activation_checkpointing"},
-}
-
-
 def _renamed(state: dict[str, Any]) -> dict[str, Any]:
-    """Return a state with today's names of what older checkpoints name otherwise."""
-    config = state.get("config")
-    groups = dict(config) if isinstance(config, dict) else {}
-    groups["new_length"] = state.get("new_length")
-    for group, names in {**_RENAMED, "new_length": {"share": "fraction"}}.items():
-        values = groups.get(group)
-        for old, new in names.items():
-            if isinstance(values, dict) and old in values:
-                values[new] = values.pop(old)
+    """Return a state with the present names of what older checkpoints name otherwise."""
+    if isinstance(config := state.get("config"), dict):
+        state["config"] = renamed(config)
+    length = state.get("new_length")
+    if isinstance(length, dict) and "share" in length:
+        length["fraction"] = length.pop("share")
     return state
 
 

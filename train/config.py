@@ -309,6 +309,28 @@ GROUPS = {
 }
 
 
+# Options of earlier versions, by group.
+_RENAMED = {
+    "views": {
+        "made": "procedural",
+        "front_share": "front_fraction",
+        "mirror": "flip",
+        "recolor": "color_jitter",
+    },
+    "optim": {"decay_share": "decay_fraction"},
+    "run": {"recompute": "activation_checkpointing"},
+}
+
+
+def renamed(values: Mapping[str, Any]) -> dict[str, Any]:
+    """Return a ``to_dict`` value with the present names of an earlier version's options."""
+    found = dict(values)
+    for group, names in _RENAMED.items():
+        if isinstance(options := found.get(group), dict):
+            found[group] = {names.get(name, name): value for name, value in options.items()}
+    return found
+
+
 def config_of(values: Mapping[str, Any], source: str) -> TrainConfig:
     """Convert a ``to_dict`` value without ``model`` to options; missing ones get their default.
 
@@ -319,12 +341,13 @@ def config_of(values: Mapping[str, Any], source: str) -> TrainConfig:
     Raises:
         UserError: an option is unknown or has an invalid value; the message names it.
     """
+    values = renamed(values)
     try:
         config = msgspec.convert(values, TrainConfig, dec_hook=lambda kind, value: kind(value))
     except (msgspec.ValidationError, UserError) as error:
         text = re.sub(r"^(.*) - at `\$\.(?:[a-z]+\.)?(\w+).*`$", r"\2: \1", str(error))
         raise UserError(f"{source}: {text}") from error
-    if unknown := sorted(_flatten(dict(values)).keys() - _flatten(config.to_dict()).keys()):
+    if unknown := sorted(_flatten(values).keys() - _flatten(config.to_dict()).keys()):
         raise UserError(f"{source}: not the options of a run (unknown {', '.join(unknown)[:200]})")
     return config
 

@@ -99,7 +99,7 @@ def contact_sheet(path: Path, rows: list[Row]) -> None:
 
 
 def save_strips(path: Path, rgb: Tensor, gt: GroundTruth, count: int = 4) -> None:
-    """Write rows of input | prediction | truth: ``count`` views evenly spaced, the input first."""
+    """Write rows of input, prediction and ground truth: ``count`` views, the input first."""
     rows = choose_views(len(rgb), 0, count)
     strips = [torch.cat([gt.rgb[0], rgb[row], gt.rgb[row]], 1) for row in rows]
     output_folder(path.parent)

@@ -65,6 +65,9 @@ def test_without_the_new_options_nothing_changes_and_older_sets_go_on(boxes, tmp
         path.write_text(json.dumps(values | {"settings": values["settings"] | older}))
         assert render_views(boxes, out, **QUICK) == 0
         assert "2 of 2 objects already in" in capsys.readouterr().out
+    path.write_text(json.dumps(values | {"settings": values["settings"] | {"light": ["usual"]}}))
+    refused("rendered with other settings", render_views, boxes, out, **QUICK)
+    path.write_text(json.dumps(values))
     refused("rendered with other settings", render_views, boxes, out, stretch=1.2, **QUICK)
 
 

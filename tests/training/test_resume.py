@@ -166,6 +166,23 @@ def test_an_option_that_an_older_run_did_not_know_has_its_default(data, tmp_path
     assert config_differences(old, now) == ["loss.novel_weight (1.0 there, 0.5 here)"]
 
 
+def test_a_config_file_of_an_earlier_version_is_read(data, tmp_path):
+    """As ``--config`` does; something else in place of a group or an option is named."""
+    config = micro.options(data, tmp_path, views={"flip": 0.5}, optim={"decay_fraction": 0.3})
+    values = config.to_dict()
+    del values["model"]
+    views, optim = values["views"], values["optim"]
+    views["mirror"], optim["decay_share"] = views.pop("flip"), optim.pop("decay_fraction")
+    assert options.config_of(values, "a") == config
+    refused(
+        "a: .*unknown views.mirrored",
+        options.config_of,
+        config.to_dict() | {"views": {**views, "mirrored": 1}},
+        "a",
+    )
+    refused("a: ", options.config_of, values | {"optim": ["decay_share"]}, "a")
+
+
 def test_the_command_of_a_configuration_means_the_same_configuration(data, tmp_path):
     groups = {"loss": {"lpips": "off", "radial_mask": False}, "length": {"minutes": 2.5}}
     config = micro.options(data, tmp_path / "a run", **groups)

@@ -181,8 +181,9 @@ def still_missing(
         except UserError as error:
             damaged[mesh.uid] = f"{error}; remove {path.parent} to render it again"
             continue
-        light = _OLDER_LIGHTS.get((stored or {}).get("light"))
-        if stored is None or _DEFAULTS | stored | (light or {}) != vars(settings):
+        light = str((stored or {}).get("light"))
+        light = {"light": _OLDER_LIGHTS[light]} if light in _OLDER_LIGHTS else {}
+        if stored is None or _DEFAULTS | stored | light != vars(settings):
             raise UserError(
                 f"{path}: was rendered with other settings ({stored}); choose another --out"
             )
@@ -191,11 +192,7 @@ def still_missing(
 
 # Defaults of settings that older datasets do not name.
 _DEFAULTS = {f.name: f.default for f in fields(Settings) if f.default is not MISSING}
-# Earlier names of the lights.
-_OLDER_LIGHTS: dict[Any, dict[str, str]] = {
-    "usual": {"light": "default"},
-    "varied": {"light": "randomized"},
-}
+_OLDER_LIGHTS = {"usual": "default", "varied": "randomized"}
 
 
 class _Stored(msgspec.Struct):
