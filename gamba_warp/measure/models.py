@@ -250,11 +250,11 @@ class Inference:
         graph.replay()
         return result
 
-    def check(self, run: Callable[[], Gaussians], truth: torch.dtype = torch.float32) -> Error:
-        """Measure the error of the Gaussians of ``run`` against ``eager``'s in ``truth``."""
+    def check(self, run: Callable[[], Gaussians], dtype: torch.dtype = torch.float32) -> Error:
+        """Measure the error of the Gaussians of ``run`` against ``eager``'s in ``dtype``."""
         got = run()
         synchronize(self.device)
-        return compare(got.tensors(), self.eager(truth).tensors())
+        return compare(got.tensors(), self.eager(dtype).tensors())
 
 
 def images(settings: Settings) -> list[Variant]:
@@ -309,9 +309,9 @@ def cuda_graphs(settings: Settings) -> list[Variant]:
         "CUDA graph, bfloat16": (graph, half, half, GRAPH_LIMITS[half], "eager, bfloat16"),
     }
     made = []
-    for name, (function, dtype, truth, limit, oracle) in runs.items():
+    for name, (function, dtype, expected, limit, oracle) in runs.items():
         run = partial(function, dtype)
-        check = partial(inference.check, run, truth)
+        check = partial(inference.check, run, expected)
         made.append(Variant(name, run, check, limit, f"{oracle} (0: the same bits)"))
         made[-1].dtype = str(dtype).removeprefix("torch.")
         made[-1].default = name == "CUDA graph, bfloat16"

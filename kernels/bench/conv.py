@@ -38,7 +38,7 @@ def operator(settings: Settings) -> list[Variant]:
 
 
 def knobs(settings: Settings) -> list[Variant]:
-    """Half precision, compared with the truth of the float32 inputs."""
+    """Half precision, compared with the exact values of the float32 inputs."""
     case = conv_case(settings.device, _SIZES.get(settings.level, _FULL))
     made = pair(case, "float32", default=True)
     for dtype in (torch.bfloat16, torch.float16):

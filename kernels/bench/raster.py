@@ -61,7 +61,7 @@ def _pair(scene: Case, name: str, **changes) -> list[Variant]:
 
 
 def _with(scene: Case, **options: Any) -> Case:
-    """Return the case with other options of ``rasterization``, compared with the same truth."""
+    """Return the case with other options of ``rasterization``, against the same exact values."""
     return replace(scene, function=partial(scene.function, **options))
 
 
@@ -99,7 +99,7 @@ def _peers(scene: Case, name: str) -> list[Variant]:
 
 
 def knobs(settings: Settings) -> list[Variant]:
-    """Accuracy traded for time, at scale 2; the truth has float32 inputs, all Gaussians, no
+    """Accuracy traded for time, at scale 2; exact values are of float32 inputs, all Gaussians, no
     threshold of alpha or T and no radius clip. The defaults suit trained Gaussians and
     other renderers.
     """

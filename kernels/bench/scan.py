@@ -68,8 +68,8 @@ def _peer(case: Case, function: Callable, channels_first: bool = True) -> Case:
 
 
 def knobs(settings: Settings) -> list[Variant]:
-    """Every choice that a caller has. Half precision is compared with the truth of the float32
-    inputs. The discretisations are different models, each compared with its own formula.
+    """Every choice that a caller has. Half precision is compared with the exact values of
+    the float32 inputs. The discretisations are different models, each with a formula of its own.
     """
     case = make_case(settings)
     made = pair(case, "float32", default=True)

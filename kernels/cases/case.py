@@ -16,11 +16,11 @@ _GRADIENT = "gradient of "
 
 
 class Error(NamedTuple):
-    """Distance of results from the truth.
+    """Distance of results from the exact ones.
 
     Attributes:
-        rel_rms: rms of the difference over rms of the truth, of the worst tensor.
-        maximum: largest difference over the largest value of the truth, of the worst tensor.
+        rel_rms: rms of the difference over rms of the exact values, of the worst tensor.
+        maximum: largest difference over the largest exact value, of the worst tensor.
         worst: name of the tensor with that ``rel_rms``.
     """
 
@@ -32,19 +32,19 @@ class Error(NamedTuple):
 def compare(got: Mapping[str, Tensor], want: Mapping[str, Tensor]) -> Error:
     """Return the error of named results in float64; NaN or a wrong shape makes it infinite."""
     rel_rms, maximum, worst = 0.0, 0.0, ""
-    for name, truth in want.items():
-        value, truth = got[name].detach().double().cpu(), truth.detach().double().cpu()
-        if value.shape != truth.shape or not value.isfinite().all():
+    for name, exact in want.items():
+        value, exact = got[name].detach().double().cpu(), exact.detach().double().cpu()
+        if value.shape != exact.shape or not value.isfinite().all():
             return Error(math.inf, math.inf, name)
-        if not truth.numel():
+        if not exact.numel():
             continue
-        difference = value - truth
-        # If the truth is all zeros, the absolute difference is used.
-        rms = truth.square().mean().sqrt().item() or 1.0
+        difference = value - exact
+        # If all exact values are 0, the absolute difference is used.
+        rms = exact.square().mean().sqrt().item() or 1.0
         relative = difference.square().mean().sqrt().item() / rms
         if relative >= rel_rms:
             rel_rms, worst = relative, name
-        maximum = max(maximum, (difference.abs().max() / (truth.abs().max() or 1.0)).item())
+        maximum = max(maximum, (difference.abs().max() / (exact.abs().max() or 1.0)).item())
     return Error(rel_rms, maximum, worst)
 
 
@@ -72,7 +72,7 @@ class Case:
     Attributes:
         function: of the inputs by name and of options; the results, one or several.
         reference: the formula, likewise, of the part.
-        inputs: float32 on the CPU, the truth that every dtype is compared with; None if left out.
+        inputs: float32 on the CPU, of which every dtype has its exact results; None if left out.
         cotangent: of the first result, for the timed gradient; the check draws its own.
         device: device of the computation.
         text: the reference in words.
@@ -86,7 +86,7 @@ class Case:
         fixed: inputs without a gradient.
         parameters: tensors of the function whose gradients are timed too, and not compared.
         compared: True to compare gradients too, not only the results.
-        truths: results of the reference so far; shared with the copies by ``replace``.
+        known: results of the reference so far; shared with the copies by ``replace``.
     """
 
     function: Callable[..., Any]
@@ -105,7 +105,7 @@ class Case:
     fixed: tuple[str, ...] = ()
     parameters: Sequence[Tensor] = ()
     compared: bool = True
-    truths: dict = field(default_factory=dict)
+    known: dict = field(default_factory=dict)
     _laid: dict = field(default_factory=dict, init=False)
 
     def oracle(self, direction: str) -> str:
@@ -156,20 +156,20 @@ class Case:
     def check(self, direction: str, dtype: torch.dtype = torch.float32, **options: Any) -> Error:
         """Return the error of the results, and of every gradient if the direction has them."""
         direction = direction if self.compared else "forward"
-        return compare(self.results(direction, dtype, **options), self.truth(direction, **options))
+        return compare(self.results(direction, dtype, **options), self.exact(direction, **options))
 
     def results(
         self, direction: str, dtype: torch.dtype = torch.float32, **options: Any
     ) -> dict[str, Tensor]:
-        """Return the results of the function, in the form of ``truth``."""
+        """Return the results of the function, in the form of ``exact``."""
         if direction != BOTH:
             got = self._named(self.forward(dtype, **options))
             return {k: self.cut(direction, k, x) for k, x in got.items()}
-        leaves, truth = self.leaves(dtype), self.truth(direction, **options)
+        leaves, exact = self.leaves(dtype), self.exact(direction, **options)
         got, heads = self._named(self.call(leaves, **options)), {}
         for k, x in got.items():
             head = torch.zeros_like(self._turn(k, x.detach()), device="cpu")
-            head[self._index(direction, k)] = self._drawn(k, truth[k]).to(head.dtype)
+            head[self._index(direction, k)] = self._drawn(k, exact[k]).to(head.dtype)
             heads[k] = self._turn(k, head).to(x.device)
         grads = gradients_of(got, wanted(leaves), heads)
         made = {k: self.cut(direction, k, x) for k, x in got.items()}
@@ -189,10 +189,10 @@ class Case:
         g = torch.Generator().manual_seed(1 + self.outputs.index(name))
         return torch.randn(like.shape, generator=g)
 
-    def truth(self, direction: str, **options: Any) -> dict[str, Tensor]:
+    def exact(self, direction: str, **options: Any) -> dict[str, Tensor]:
         """Return the results, and if asked for the gradients, of the part in float64; kept."""
         key = direction, *sorted(options.items())
-        if key not in self.truths:
+        if key not in self.known:
             seen = {
                 k: x if x is None else x[self._index(direction, k)].double()
                 for k, x in self.inputs.items()
@@ -200,12 +200,12 @@ class Case:
             leaves = _leaves(seen, self.fixed)
             with torch.set_grad_enabled(direction == BOTH):
                 results = self._named(self.reference(**leaves, **options))
-            self.truths[key] = {k: x.detach() for k, x in results.items()}
+            self.known[key] = {k: x.detach() for k, x in results.items()}
             if direction == BOTH:
                 heads = {k: self._drawn(k, x) for k, x in results.items()}
                 grads = gradients_of(results, wanted(leaves), heads)
-                self.truths[key] |= {_GRADIENT + k: x for k, x in grads.items()}
-        return self.truths[key]
+                self.known[key] |= {_GRADIENT + k: x for k, x in grads.items()}
+        return self.known[key]
 
 
 def _leaves(inputs: Mapping[str, Any], fixed: tuple[str, ...]) -> dict[str, Any]:

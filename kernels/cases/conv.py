@@ -146,8 +146,8 @@ def evaluate(case: RandomCase, device: torch.device, trial: int = 0) -> Outcome:
     cuts = borders(case, device)
     out, final = scan_oracle.of_sequences(exact, samples, cuts)
     leaves = {k: t for k, t in x.items() if t is not None}
-    truths, true_leaves = {"out": out, "final": final}, {k: samples[k] for k in leaves}
-    runs = Runs(case, lambda: _run(o, x, cuts), leaves, truths, true_leaves)
+    expected, sample_leaves = {"out": out, "final": final}, {k: samples[k] for k in leaves}
+    runs = Runs(case, lambda: _run(o, x, cuts), leaves, expected, sample_leaves)
     return runs.outcome({"out": (1,), "x": (1,)})
 
 

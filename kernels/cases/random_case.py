@@ -55,13 +55,13 @@ class Comparison:
 
     Attributes:
         name: name of the result, such as "out" or "gradient of u".
-        error: rms of the difference over rms of the truth, of the whole tensor.
+        error: rms of the difference over rms of the exact values, of the whole tensor.
         ratio: error of the worst part over its limit; above 1 the result fails.
-        nonfinite: count of numbers that are NaN or infinite although the truth fits in the dtype.
-        counts: True to show ``error``, as for a float32 result whose truth is well
+        nonfinite: count of numbers that are NaN or infinite where the dtype holds the exact value.
+        counts: True to show ``error``, as for a float32 result whose exact values are well
             above numbers that may count as 0, and not itself the rounding error of a sum that
             cancels.
-        noise: True if rounding changes the worst part by more than half of its truth.
+        noise: True if rounding changes the worst part by more than half of its exact value.
     """
 
     name: str
@@ -217,9 +217,9 @@ def fill(shape: Sequence[int], kind: str, g: torch.Generator) -> Tensor:
     return normal * {"tiny": 1e-12, "denormal": 1e-40, "huge": 1e4}.get(kind, 1.0)
 
 
-def fits(truth: Tensor, dtype: torch.dtype) -> Tensor:
-    """Return the mask of a truth's numbers that a dtype holds; others may come out infinite."""
-    return truth.detach().abs() < 0.99 * torch.finfo(dtype).max
+def fits(exact: Tensor, dtype: torch.dtype) -> Tensor:
+    """Return the mask of the exact values that a dtype holds; others may come out infinite."""
+    return exact.detach().abs() < 0.99 * torch.finfo(dtype).max
 
 
 def judge(
@@ -235,7 +235,7 @@ def judge(
     Args:
         name: name of the result.
         got: the result, float dtype.
-        samples: ``[SAMPLES, *got.shape]`` float64; sample 0 is the truth.
+        samples: ``[SAMPLES, *got.shape]`` float64; sample 0 is exact.
         parts: dimensions of ``got`` that are taken together as one rms; () compares each number.
         extra: addition to the limit, of ``got``'s shape without ``parts``.
         shown: mask of the numbers that make up ``error``; the limit holds for all numbers.
@@ -246,7 +246,7 @@ def judge(
     samples, value = samples.detach(), got.detach().cpu().double()
     want = samples[0]
     if value.shape != want.shape:
-        raise ValueError(f"{name} has shape {tuple(value.shape)}, the truth {tuple(want.shape)}")
+        raise ValueError(f"{name} has shape {tuple(value.shape)}, not {tuple(want.shape)}")
     if not want.numel():
         return Comparison(name, 0.0, 0.0)
     relative, absolute = _STORED[got.dtype]
@@ -284,7 +284,7 @@ class Runs:
         case: its option "cotangent" names the range of the cotangents.
         run: returns the results by name.
         leaves: tensors that need a gradient, by name.
-        truths: the formula's results, and perhaps more, ``[SAMPLES, ..]``.
+        expected: the formula's results, and perhaps more, ``[SAMPLES, ..]``.
         samples: the formula's leaves.
         without: mask of the results that need no gradient.
     """
@@ -294,7 +294,7 @@ class Runs:
         case: RandomCase,
         run: Callable[[], dict[str, Tensor]],
         leaves: dict[str, Tensor],
-        truths: dict[str, Tensor],
+        expected: dict[str, Tensor],
         samples: dict[str, Tensor],
         without: Tensor | None = None,
     ) -> None:
@@ -313,8 +313,8 @@ class Runs:
             for name, a, b in pairs
             if not torch.equal(a.nan_to_num(1.5), b.nan_to_num(1.5))
         ]
-        self.truths = {n: truths[n] for n in self.results}
-        self.true_grads = gradients_of(self.truths, samples, self.cotangents)
+        self.expected = {n: expected[n] for n in self.results}
+        self.expected_grads = gradients_of(self.expected, samples, self.cotangents)
 
     def outcome(self, parts: dict[str, tuple[int, ...]], **extra: dict[str, Any]) -> Outcome:
         """Judge all results, then all gradients.
@@ -324,11 +324,11 @@ class Runs:
             extra: further arguments of ``judge`` by name of the result.
         """
         made = [
-            judge(n, x, self.truths[n], parts.get(n, ()), **extra.get(n, {}))
+            judge(n, x, self.expected[n], parts.get(n, ()), **extra.get(n, {}))
             for n, x in self.results.items()
         ]
         made += [
-            judge(f"gradient of {k}", g, self.true_grads[k], parts.get(k, ()))
+            judge(f"gradient of {k}", g, self.expected_grads[k], parts.get(k, ()))
             for k, g in self.grads.items()
         ]
         return Outcome(made, self.faults)

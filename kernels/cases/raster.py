@@ -347,7 +347,7 @@ def gaussians_axis(o: dict, name: str) -> int:
     return len(LEADS[o["lead"]]) + (name == "colors" and o["colors_per_view"])
 
 
-def truth(case: RandomCase, x: dict[str, Tensor | None], trial: int = 0) -> tuple[dict, View]:
+def exact_image(case: RandomCase, x: dict[str, Tensor | None], trial: int = 0) -> tuple[dict, View]:
     """Return the leaves by name, and all views in float64, as ``rasterization`` renders them.
 
     Each of the view's tensors is ``[.., *lead, V, H, W, C + 1]``; the last channel is alpha.
@@ -417,7 +417,7 @@ def evaluate(case: RandomCase, device: torch.device, trial: int = 0) -> Outcome:
     """Run the operator; compare images pixel by pixel, gradients Gaussian by Gaussian."""
     o, x = case.options, build(case, device)
     leaves = {k: t for k, t in x.items() if t is not None and k != "Ks"}
-    samples, image = truth(case, x, trial)
+    samples, image = exact_image(case, x, trial)
     names = ("alpha_min", "alpha_max", "eps2d", "radius_clip", "width", "height")
 
     def run(x: dict = x) -> dict[str, Tensor]:
@@ -431,8 +431,8 @@ def evaluate(case: RandomCase, device: torch.device, trial: int = 0) -> Outcome:
         )
         return {"renders": renders, "alphas": alphas}
 
-    truths = {"renders": image.blended[..., :-1], "alphas": image.blended[..., -1:]}
-    runs = Runs(case, run, leaves, truths, samples, without=image.loose)
+    expected = {"renders": image.blended[..., :-1], "alphas": image.blended[..., -1:]}
+    runs = Runs(case, run, leaves, expected, samples, without=image.loose)
     outcome = runs.outcome(
         _PARTS,
         renders={"extra": image.allowance[..., :-1], "shown": ~image.undecided},
@@ -456,7 +456,7 @@ def _poison_faults(case: RandomCase, x: dict, run, runs: Runs) -> list[str]:
         axis = gaussians_axis(case.options, name)
         kept = other.index_select(axis, old.to(other.device)) if of_gaussian else other
         # A gradient beyond its dtype's range is infinite, whatever the other Gaussians.
-        beyond = ~fits(runs.true_grads[name][0], kept.dtype).to(kept.device)
+        beyond = ~fits(runs.expected_grads[name][0], kept.dtype).to(kept.device)
         allowed = int((beyond & ~kept.isfinite()).sum())
         if int((~other.isfinite()).sum()) > allowed:
             faults.append(f"gradient of {name} not finite next to Gaussians that are not")

@@ -338,8 +338,8 @@ def evaluate(case: RandomCase, device: torch.device, trial: int = 0) -> Outcome:
     cuts = borders(case, device)
     out, last = scan_oracle.of_sequences(exact, used, cuts)
     leaves = {k: t for k, t in x.items() if t is not None}
-    truths = {"out": out[:, :, o["split"] :], "last": last}
-    runs = Runs(case, lambda: _run(o, x, cuts), leaves, truths, {k: samples[k] for k in leaves})
+    expected = {"out": out[:, :, o["split"] :], "last": last}
+    runs = Runs(case, lambda: _run(o, x, cuts), leaves, expected, {k: samples[k] for k in leaves})
     # the tokens of a channel are taken together
     parts: dict[str, tuple[int, ...]] = dict.fromkeys(("out", "u", "delta", "z", "C"), (1,))
     return runs.outcome(parts if o["constant_B"] else parts | {"B": (1,)})

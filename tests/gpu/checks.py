@@ -74,13 +74,13 @@ def check_scan(shape: tuple, dtype: torch.dtype, device: torch.device) -> float:
     case = scan_of(shape, device)
     if dtype != torch.float32:
         return assert_within(case.check(BOTH, dtype), HALF_LIMIT)
-    got, truth = case.results(BOTH), case.truth(BOTH)
-    limits = dict.fromkeys(truth, LIMIT)
+    got, expected = case.results(BOTH), case.exact(BOTH)
+    limits = dict.fromkeys(expected, LIMIT)
     if gpu.kind_of(device) == "cuda":
-        more = allowances(lambda off: case.truth(BOTH, off=off))
-        limits = {name: LIMIT + more[name] for name in truth}
-    errors = {name: compare({name: got[name]}, {name: truth[name]}) for name in truth}
-    nearest = max(truth, key=lambda name: errors[name].rel_rms / limits[name])
+        more = allowances(lambda off: case.exact(BOTH, off=off))
+        limits = {name: LIMIT + more[name] for name in expected}
+    errors = {name: compare({name: got[name]}, {name: expected[name]}) for name in expected}
+    nearest = max(expected, key=lambda name: errors[name].rel_rms / limits[name])
     return assert_within(errors[nearest], limits[nearest])
 
 

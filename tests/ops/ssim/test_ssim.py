@@ -20,7 +20,7 @@ def images(shape, seed=0):
     return got, want
 
 
-def truth(got, want):
+def expected(got, want):
     got = got.double().requires_grad_()
     value = dissimilarity_reference(got, want.double())
     return value.detach(), torch.autograd.grad(value.sum(), got)[0]
@@ -34,7 +34,7 @@ def test_value_and_gradient_are_those_of_the_definition(monkeypatch, shape, toge
     monkeypatch.setattr(lanes, "_TOGETHER", together)
     got, want = images(shape)
     value, slope = dissimilarity(got, want, True)
-    wanted, gradient = truth(got, want)
+    wanted, gradient = expected(got, want)
     torch.testing.assert_close(value.double(), wanted, rtol=0, atol=1e-6)
     # Variances have 24 bits, and C2 = 9e-4 stands beside them: some digits are lost.
     error = (slope.double() - gradient).norm() / gradient.norm()
@@ -50,7 +50,7 @@ def test_products_in_float64(monkeypatch, shape, together):
     monkeypatch.setattr(products, "_TOGETHER", together)
     got, want = (x.double() for x in images(shape))
     value, slope = dissimilarity(got, want, True)
-    wanted, gradient = truth(got, want)
+    wanted, gradient = expected(got, want)
     torch.testing.assert_close(value, wanted, rtol=0, atol=1e-13)
     # C2 stands beside variances that are differences: three of sixteen digits are lost.
     torch.testing.assert_close(slope, gradient, rtol=1e-9, atol=1e-13)
@@ -62,7 +62,7 @@ def test_flat_images_keep_their_digits():
     g = torch.Generator().manual_seed(2)
     want = torch.full((1, 24, 24, 3), 0.9)
     got = want + 1e-3 * torch.randn(want.shape, generator=g)
-    wanted, gradient = truth(got, want)
+    wanted, gradient = expected(got, want)
     value, slope = dissimilarity(got, want, True)
     torch.testing.assert_close(value.double(), wanted, rtol=1e-3, atol=0)
     assert (slope.double() - gradient).norm() < 1e-3 * gradient.norm()
@@ -76,7 +76,7 @@ def test_one_differing_pixel_is_found_anywhere(place, dtype):
     got = want.clone()
     got[1, place[0], place[1]] += 0.5
     value, slope = dissimilarity(got, want, True)
-    wanted, gradient = truth(got, want)
+    wanted, gradient = expected(got, want)
     exact, rtol, atol = (1e-6, 1e-3, 1e-7) if dtype == torch.float32 else (1e-12, 1e-9, 1e-12)
     torch.testing.assert_close(value.double(), wanted, rtol=0, atol=exact)
     torch.testing.assert_close(slope.double(), gradient, rtol=rtol, atol=atol)

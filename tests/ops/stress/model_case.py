@@ -241,9 +241,9 @@ def evaluate(case: RandomCase, device: torch.device, trial: int = 0) -> Outcome:
     leaves = inputs | dict(model.named_parameters())
     oracle = _Oracle(case, model, trial)
     samples = {k: samples_of(x) for k, x in inputs.items()}
-    truths = oracle.run(samples, cameras)
+    expected = oracle.run(samples, cameras)
     run = partial(_run, model, case.options, inputs, cameras)
-    runs = Runs(case, run, leaves, truths, samples | oracle.weights)
+    runs = Runs(case, run, leaves, expected, samples | oracle.weights)
     sizes = {k: x.dim() for k, x in (*leaves.items(), *runs.results.items())}
     return runs.outcome({k: tuple(range(n)) for k, n in sizes.items()})
 
