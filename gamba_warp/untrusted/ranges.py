@@ -120,18 +120,19 @@ def check_values(values: Mapping[str, Any], owner: Callable, label: Callable[[st
     Raises:
         UserError: as for ``check_range``.
     """
-    hints = _hints(owner)
-    for name, value in values.items():
-        for limits in _limits(hints.get(name)):
-            for item in value if isinstance(value, (list, tuple)) else [value]:
-                if isinstance(item, (int, float)) and not isinstance(item, bool):
+    for name, ranges in _ranges(owner).items():
+        value = values.get(name)
+        for item in value if isinstance(value, (list, tuple)) else [value]:
+            if isinstance(item, (int, float)) and not isinstance(item, bool):
+                for limits in ranges:
                     check_range(label(name), item, limits)
 
 
 @functools.cache
-def _hints(owner: Callable) -> dict[str, Any]:
-    """Types of a dataclass's fields or a function's arguments, by name."""
-    return typing.get_type_hints(owner, include_extras=True)
+def _ranges(owner: Callable) -> dict[str, list[Meta]]:
+    """Ranges declared by a dataclass's fields or a function's arguments, by name."""
+    hints = typing.get_type_hints(owner, include_extras=True)
+    return {name: limits for name, hint in hints.items() if (limits := _limits(hint))}
 
 
 def _limits(hint: Any) -> list[Meta]:
