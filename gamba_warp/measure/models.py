@@ -50,9 +50,9 @@ def tables(settings: Settings) -> list[Table]:
     """Return the tables of models."""
     builders = {"backbone": backbone, "mixers": mixers}
     builders |= {"one image": images, "skipping": skipping}
-    made = [Table("model", name, build) for name, build in builders.items()]
+    tables = [Table("model", name, build) for name, build in builders.items()]
     graphs = [Table("model", "CUDA graph", cuda_graphs)]
-    return made + graphs * (settings.device.type == "cuda")
+    return tables + graphs * (settings.device.type == "cuda")
 
 
 def blocks_case(settings: Settings, depth: int) -> Case:
@@ -146,16 +146,16 @@ def backbone(settings: Settings) -> list[Variant]:
     """One block and all blocks of the paper's size on one image's tokens. Prefix states off:
     condition prepended and dropped in each block, as the paper has it.
     """
-    made = []
+    variants = []
     for depth in (1, 2 if settings.level == "quick" else 14):
         blocks, rounds = blocks_case(settings, depth), 3 if depth > 2 else None
         name = f"{depth} block{'s' * (depth > 1)}"
-        made.append(variant(blocks, name, default=True, rounds=rounds))
+        variants.append(variant(blocks, name, default=True, rounds=rounds))
         prepended = replace(blocks, function=partial(blocks.function, prepend=True))
-        made.append(variant(prepended, f"{name}, prefix states off", rounds=rounds))
+        variants.append(variant(prepended, f"{name}, prefix states off", rounds=rounds))
         if depth == 1:
-            made.append(variant(blocks, name, BOTH, default=True))
-    return made
+            variants.append(variant(blocks, name, BOTH, default=True))
+    return variants
 
 
 def mixers(settings: Settings) -> list[Variant]:
@@ -164,7 +164,7 @@ def mixers(settings: Settings) -> list[Variant]:
     gradient. The check is a second run.
     """
     lengths = {"quick": (256, 512), "normal": (1024, 4096), "full": (4096, 16384, 65536)}
-    config, made = replace(PRESETS["tiny"], width=256), []
+    config, variants = replace(PRESETS["tiny"], width=256), []
     for length in lengths[settings.level]:
         tokens = torch.randn(1, length, config.width)
         for name, kind in (("Mamba", GambaBlock), ("transformer", AttentionBlock)):
@@ -184,10 +184,10 @@ def mixers(settings: Settings) -> list[Variant]:
             for direction in DIRECTIONS:
                 check = partial(difference, case, case, direction)
                 title = f"{name}, {length} tokens"
-                made.append(variant(case, title, direction, rounds=3, check=check))
-                made[-1].peer = name == "transformer"
-            made[-1].work = partial(_saved, case)
-    return made
+                variants.append(variant(case, title, direction, rounds=3, check=check))
+                variants[-1].peer = name == "transformer"
+            variants[-1].work = partial(_saved, case)
+    return variants
 
 
 def _saved(case: Case) -> dict[str, int]:
@@ -261,15 +261,15 @@ def images(settings: Settings) -> list[Variant]:
     """A posed image to Gaussians by preset, without the image encoder. The models are whole and
     have fresh weights; two runs must give the same bits.
     """
-    made = []
+    variants = []
     for name in ("tiny", "rays") if settings.level == "quick" else PRESETS:
         torch.manual_seed(0)
         model = Inference(Gamba(without_encoder(PRESETS[name])), settings.device)
         check = partial(model.check, model.eager)
         oracle = "a second run (0: the same bits); the blocks have the float64 oracle"
-        made.append(Variant(name, model.eager, check, 0.0, oracle, default=True, rounds=10))
-        made[-1].parameters = model.sizes
-    return made
+        variants.append(Variant(name, model.eager, check, 0.0, oracle, default=True, rounds=10))
+        variants[-1].parameters = model.sizes
+    return variants
 
 
 def skipping(settings: Settings) -> list[Variant]:
@@ -308,12 +308,12 @@ def cuda_graphs(settings: Settings) -> list[Variant]:
         "CUDA graph, float32": (graph, full, full, GRAPH_LIMITS[full], "eager"),
         "CUDA graph, bfloat16": (graph, half, half, GRAPH_LIMITS[half], "eager, bfloat16"),
     }
-    made = []
+    variants = []
     for name, (function, dtype, expected, limit, oracle) in runs.items():
         run = partial(function, dtype)
         check = partial(inference.check, run, expected)
-        made.append(Variant(name, run, check, limit, f"{oracle} (0: the same bits)"))
-        made[-1].dtype = str(dtype).removeprefix("torch.")
-        made[-1].default = name == "CUDA graph, bfloat16"
-        made[-1].parameters = inference.sizes | {"encoder": encoder}
-    return made
+        variants.append(Variant(name, run, check, limit, f"{oracle} (0: the same bits)"))
+        variants[-1].dtype = str(dtype).removeprefix("torch.")
+        variants[-1].default = name == "CUDA graph, bfloat16"
+        variants[-1].parameters = inference.sizes | {"encoder": encoder}
+    return variants

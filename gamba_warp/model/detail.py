@@ -141,11 +141,11 @@ def split_front(
     parent = cells.new_full((side * side,), -1)
     parent[cells] = torch.arange(len(cells), device=device)
     fields = _fields(front, cells, alpha, camera)
-    made = [
+    parts = [
         _children(front, parent, fields, counts == count, count, shown, camera)
         for count in sorted({2, detail})
     ]
-    children, pixels = _concatenate([one for one, _ in made]), torch.cat([at for _, at in made])
+    children, pixels = _concatenate([one for one, _ in parts]), torch.cat([at for _, at in parts])
     stays = ~is_front
     stays[is_front] = ~splits
     return _correct(whole.select(stays), children, pixels, shown, camera, detail)

@@ -172,8 +172,8 @@ class Case:
             head[self._index(direction, k)] = self._drawn(k, exact[k]).to(head.dtype)
             heads[k] = self._turn(k, head).to(x.device)
         grads = gradients_of(got, wanted(leaves), heads)
-        made = {k: self.cut(direction, k, x) for k, x in got.items()}
-        return made | {_GRADIENT + k: self.cut(direction, k, x) for k, x in grads.items()}
+        results = {k: self.cut(direction, k, x) for k, x in got.items()}
+        return results | {_GRADIENT + k: self.cut(direction, k, x) for k, x in grads.items()}
 
     def cut(self, direction: str, name: str, x: Tensor) -> Tensor:
         """Return the part of a result or gradient, laid out as the reference's."""

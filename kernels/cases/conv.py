@@ -110,14 +110,14 @@ def build(case: RandomCase, device: torch.device) -> dict[str, Tensor | None]:
     g = {name: generator(case, name) for name in ("x", "weight", "rest")}
     before = max(batch, o["sequences"]), width - 1, channels
     state = fill(before, case.kind, g["rest"]) if o["use_state"] else None
-    made = {
+    leaves = {
         "x": laid(fill((batch, length, channels), case.kind, g["x"]).to(dtype), o["layout"]),
         "weight": fill((channels, width), o["weight"], g["weight"]),
         "bias": torch.randn(channels, generator=g["rest"]) if o["use_bias"] else None,
         "initial_state": None if state is None else state.to(dtype),
     }
     return {
-        k: None if x is None else x.to(device).detach().requires_grad_() for k, x in made.items()
+        k: None if x is None else x.to(device).detach().requires_grad_() for k, x in leaves.items()
     }
 
 

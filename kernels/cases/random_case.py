@@ -323,12 +323,12 @@ class Runs:
             parts: of ``judge`` by name; () without parts.
             extra: further arguments of ``judge`` by name of the result.
         """
-        made = [
+        comparisons = [
             judge(n, x, self.expected[n], parts.get(n, ()), **extra.get(n, {}))
             for n, x in self.results.items()
         ]
-        made += [
+        comparisons += [
             judge(f"gradient of {k}", g, self.expected_grads[k], parts.get(k, ()))
             for k, g in self.grads.items()
         ]
-        return Outcome(made, self.faults)
+        return Outcome(comparisons, self.faults)

@@ -292,19 +292,19 @@ def build(case: RandomCase, device: torch.device) -> dict[str, Tensor | None]:
     colors = (batch, num, 16 if o["sh_degree"] == "3" else 5, 3)
     if o["sh_degree"] == "none":
         colors = (batch, *([o["views"]] if o["colors_per_view"] else []), num, o["channels"])
-    made = {
+    leaves = {
         "means": points.float(),
         **_shapes(o, kind, (batch, num), g),
         "colors": fill(colors, o["colors"], g["colors"]),
     }
     dtype = DTYPES[o["dtype"]]
     limit = torch.finfo(dtype).max
-    made = {k: x if x is None else x.clamp(-limit, limit).to(dtype) for k, x in made.items()}
-    made |= {"viewmats": viewmats.float(), "Ks": Ks, "backgrounds": None}
+    leaves = {k: x if x is None else x.clamp(-limit, limit).to(dtype) for k, x in leaves.items()}
+    leaves |= {"viewmats": viewmats.float(), "Ks": Ks, "backgrounds": None}
     if o["backgrounds"]:
         shape = (batch, o["views"], o["channels"] if o["sh_degree"] == "none" else 3)
-        made["backgrounds"] = torch.rand(shape, generator=g["rest"])
-    shaped = {k: x if x is None else x.reshape(*lead, *x.shape[1:]) for k, x in made.items()}
+        leaves["backgrounds"] = torch.rand(shape, generator=g["rest"])
+    shaped = {k: x if x is None else x.reshape(*lead, *x.shape[1:]) for k, x in leaves.items()}
     return {
         k: x if x is None else x.to(device).requires_grad_(k != "Ks") for k, x in shaped.items()
     }
@@ -335,11 +335,11 @@ def poisoned(case: RandomCase, x: dict[str, Tensor | None]) -> tuple[dict[str, A
         if name == "colors" and o["sh_degree"] != "none":
             row = row[..., 0]  # the first coefficient is always used
         row.fill_((torch.nan, torch.inf, -torch.inf)[torch.randint(3, (), generator=g)])
-    made: dict[str, Any] = {**x}
+    leaves: dict[str, Any] = {**x}
     for name, row in rows.items():
         row = row.movedim(0, gaussians_axis(o, name)).contiguous()
-        made[name] = row.to(made[name].device).requires_grad_()
-    return made, old
+        leaves[name] = row.to(leaves[name].device).requires_grad_()
+    return leaves, old
 
 
 def gaussians_axis(o: dict, name: str) -> int:
@@ -365,13 +365,13 @@ def exact_image(case: RandomCase, x: dict[str, Tensor | None], trial: int = 0) -
     Ks = x["Ks"]
     assert Ks is not None
     Ks = Ks.detach().cpu().double().reshape(count, o["views"], 3, 3)
-    made = [
+    views = [
         _view(o, {k: t[:, b] for k, t in objects.items()}, v, Ks[b, v], r)
         for b in range(count)
         for v in range(o["views"])
     ]
     shape = *lead, o["views"], o["height"], o["width"]
-    stacked = [torch.stack(parts, int(i == 0)) for i, parts in enumerate(zip(*made))]
+    stacked = [torch.stack(parts, int(i == 0)) for i, parts in enumerate(zip(*views))]
     return leaves, View(*(t.reshape(*t.shape[: t.dim() - 3], *shape, t.shape[-1]) for t in stacked))
 
 

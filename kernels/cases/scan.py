@@ -273,7 +273,7 @@ def build(case: RandomCase, device: torch.device) -> dict[str, Tensor | None]:
     rest = partial(torch.randn, generator=g["rest"])
     steps, rates = _steps_and_rates(o, token, g)
     B_shape = (channels, n) if o["constant_B"] else grouped
-    made = {
+    leaves = {
         "u": fill(token, o["u"], g["u"]),
         "delta": steps,
         "A": rates,
@@ -285,16 +285,16 @@ def build(case: RandomCase, device: torch.device) -> dict[str, Tensor | None]:
         "initial_state": rest(max(batch, o["sequences"]), channels, n) if o["use_state"] else None,
     }
     if o["use_bias"] and not o["softplus"]:
-        made["delta_bias"] = 0.01 * rest(channels).abs()
+        leaves["delta_bias"] = 0.01 * rest(channels).abs()
     dtypes = {"u": "dtype", "z": "dtype", "B": "dtype", "C": "dtype", "delta": "delta_dtype"}
     for name, option in dtypes.items():
-        if made[name] is not None:
+        if leaves[name] is not None:
             limit = torch.finfo(DTYPES[o[option]]).max
-            made[name] = made[name].clamp(-limit, limit).to(DTYPES[o[option]])
+            leaves[name] = leaves[name].clamp(-limit, limit).to(DTYPES[o[option]])
             if name != "B" or not o["constant_B"]:
-                made[name] = laid(made[name].to(device), o["layout"])
+                leaves[name] = laid(leaves[name].to(device), o["layout"])
     return {
-        k: None if x is None else x.to(device).detach().requires_grad_() for k, x in made.items()
+        k: None if x is None else x.to(device).detach().requires_grad_() for k, x in leaves.items()
     }
 
 

@@ -177,7 +177,7 @@ def causal_conv1d_fn(
     """
     if seq_idx is not None and (initial_states is not None or return_final_states):
         raise ValueError("seq_idx and states are given; causal_conv1d with cu_seqlens takes both")
-    made = causal_conv1d(
+    result = causal_conv1d(
         tokens_first(x, "x"),
         weight,
         bias,
@@ -186,7 +186,7 @@ def causal_conv1d_fn(
         return_final_state=return_final_states or final_states_out is not None,
         seq_idx=seq_idx,
     )
-    both = made if isinstance(made, tuple) else (made, None)
+    both = result if isinstance(result, tuple) else (result, None)
     out, final = (None if y is None else y.transpose(1, 2) for y in both)
     assert out is not None
     if seq_idx is not None:

@@ -125,12 +125,12 @@ def _conv_backward(dout, x, weight, bias, state, packed, silu, needs):
 
 @_conv_backward.register_fake
 def _(dout, x, weight, bias, state, packed, silu, needs):
-    made = [
+    grads = [
         torch.empty_like(a, memory_format=torch.contiguous_format)
         for a, needed in zip((x, weight, bias, state), needs)
         if needed
     ]
-    return [laid_as(x, x.new_empty), *made[1:]] if needs[0] else made
+    return [laid_as(x, x.new_empty), *grads[1:]] if needs[0] else grads
 
 
 def _setup_context(ctx, inputs, output):

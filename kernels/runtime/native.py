@@ -157,11 +157,11 @@ def _kernel(
     # Warp reads the source of a kernel, and finds it there, as debuggers do.
     file = f"<{name}({', '.join(arguments)})>"
     linecache.cache[file] = len(source), None, source.splitlines(True), file
-    made: dict[str, Any] = {"__name__": __name__, "wp": wp}
-    exec(compile(source, file, "exec"), made)
-    native, kernel = made[f"{name}_native"], made[name]
+    namespace: dict[str, Any] = {"__name__": __name__, "wp": wp}
+    exec(compile(source, file, "exec"), namespace)
+    native, kernel = namespace[f"{name}_native"], namespace[name]
     native.__annotations__, kernel.__annotations__ = own, arguments
-    made[f"{name}_native"] = wp.func_native(text)(native)
+    namespace[f"{name}_native"] = wp.func_native(text)(native)
     build = wp.ModuleBuildOptions(extra_cpu_preamble=header, extra_cuda_preamble=header)
     options["module_options"] = {"extra_build_options": build}
     return wp.kernel(kernel, enable_backward=False, module="unique", **options)

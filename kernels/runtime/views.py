@@ -71,10 +71,12 @@ def _describe(tensor: Tensor, dtype, name: str) -> Any:
         if tensor.dtype != scalar:
             raise TypeError(f"{name} must have dtype {scalar}, got {tensor.dtype}")
     try:
-        made: Any = wp.from_torch(tensor, dtype=dtype, requires_grad=False, return_ctype=True)
+        descriptor: Any = wp.from_torch(tensor, dtype=dtype, requires_grad=False, return_ctype=True)
     except RuntimeError as error:
         raise ValueError(f"{name}: {error}") from error
-    return type(made).from_buffer_copy(made)  # a copy that does not keep the tensor alive
+    return type(descriptor).from_buffer_copy(
+        descriptor
+    )  # a copy that does not keep the tensor alive
 
 
 class StructValue:
@@ -113,7 +115,7 @@ _structs: dict[tuple, Any] = {}  # one for each struct, and its arrays' dtypes, 
 
 def _filled_with(cls: Any, values: tuple) -> Any:
     """Return the C structure of a struct with these values."""
-    made = cls.ctype()
+    structure = cls.ctype()
     for x, (name, var) in zip(values, cls.vars.items(), strict=True):
         if isinstance(x, Tensor):
             dtype = var.type.dtype
@@ -122,8 +124,8 @@ def _filled_with(cls: Any, values: tuple) -> Any:
                 x = x.view(-1, *x.shape[x.dim() - inner :]) if inner else x.view(-1)
             x = view(x, dtype)
         if x is not None:
-            setattr(made, name, x)
-    return made
+            setattr(structure, name, x)
+    return structure
 
 
 @functools.lru_cache(1024)
@@ -132,10 +134,10 @@ def filled(cls: type[_Class], *values: float) -> _Class:
 
     It is kept, because to fill one takes as long as a short launch.
     """
-    made = cls()
+    instance = cls()
     for name, value in zip(cast(Any, cls).vars, values, strict=True):
-        setattr(made, name, value)
-    return made
+        setattr(instance, name, value)
+    return instance
 
 
 def struct(cls: type[_Class]) -> type[_Class]:

@@ -126,8 +126,8 @@ class RayDecoder(nn.Module):
             hidden = self.mix(F.silu(hidden))
         with torch.autocast(tokens.device.type, enabled=False):
             out = self.head(F.silu(hidden.float())).unflatten(-1, (self.config.ray_layers, -1))
-            made = self._activated(out, colors, alpha, foreground.cell, cameras)
-            return _padded(made, foreground)
+            gaussians = self._activated(out, colors, alpha, foreground.cell, cameras)
+            return _padded(gaussians, foreground)
 
     def _stem(self, pixels: Tensor, foreground: Foreground) -> Tensor:
         """Apply ``stem`` to ``pixels``, at the cells: ``[T, C]``.
@@ -193,7 +193,7 @@ def _with_reach(first: int, end: int, side: int) -> tuple[int, int]:
     return begin, begin + length
 
 
-def _padded(made: Gaussians, foreground: Foreground) -> Gaussians:
+def _padded(gaussians: Gaussians, foreground: Foreground) -> Gaussians:
     """Pad Gaussians ``[T, layers]`` of all cells to ``[B, N]``; the padding comes last."""
     shape = len(foreground.counts), foreground.most
 
@@ -202,11 +202,11 @@ def _padded(made: Gaussians, foreground: Foreground) -> Gaussians:
         return out.index_copy_(0, foreground.slot, values).unflatten(0, shape).flatten(1, 2)
 
     return Gaussians(
-        means=padded(made.means),
-        quats=None if made.quats is None else padded(made.quats, 1.0),
-        scales=padded(made.scales, 1.0),
-        opacities=padded(made.opacities),
-        colors=padded(made.colors),
+        means=padded(gaussians.means),
+        quats=None if gaussians.quats is None else padded(gaussians.quats, 1.0),
+        scales=padded(gaussians.scales, 1.0),
+        opacities=padded(gaussians.opacities),
+        colors=padded(gaussians.colors),
     )
 
 

@@ -114,8 +114,8 @@ def bin_views(grid: Grid, projected: Projected, check: Callable[[int], None]) ->
     if not by_depth:
         torch.arange(images * num, out=order)
     ordered = order if by_depth else None  # none: by index
-    made = dict(offsets=offsets, starts=starts, count=count)
-    lists = as_struct(Bins(order=ordered, **made))
+    sizes = dict(offsets=offsets, starts=starts, count=count)
+    lists = as_struct(Bins(order=ordered, **sizes))
     if by_depth and images:
         _sort_lists(images, num, splats, None, lists)
     parallel_launch(_count, tasks, [parts, grid, splats, lists, work], pieces=tasks)
@@ -123,7 +123,7 @@ def bin_views(grid: Grid, projected: Projected, check: Callable[[int], None]) ->
     total = int(count)
     check(total)
     intersections, rows = (empty([total], torch.int32) for _ in range(2))
-    bins = Bins(order=order, pairs=intersections, rows=rows, **made)
+    bins = Bins(order=order, pairs=intersections, rows=rows, **sizes)
     lists = as_struct(bins._replace(order=ordered))
     staged = None if by_depth else empty([total, 3], torch.int32)
     parallel_launch(_scatter, tasks, [parts, grid, splats, work, lists, staged], pieces=tasks)

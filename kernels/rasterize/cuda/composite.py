@@ -49,9 +49,9 @@ def _launch(
     for first in range(0, channels if warps else 0, chunk):
         gaussians = StructValue(Gaussians, records, channels, first)
         arguments = [params, gaussians, *inputs]
-        made, threads = kernel(min(chunk, channels - first)), WARP * block
+        compiled, threads = kernel(min(chunk, channels - first)), WARP * block
         cuda_launch(
-            made, (warps, WARP), arguments, outputs, device=records.device, block_dim=threads
+            compiled, (warps, WARP), arguments, outputs, device=records.device, block_dim=threads
         )
 
 
