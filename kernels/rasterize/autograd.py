@@ -16,10 +16,8 @@ from ..runtime.operator import operator
 from .constants import BLOCKS
 from .cpu import bin as bin_cpu
 from .cpu import composite as composite_cpu
-from .cpu.project import project_on_lanes, vjp_on_lanes
 from .cuda import bin as bin_cuda
 from .cuda import composite as composite_cuda
-from .cuda.project import project_on_threads, vjp_on_threads
 from .projection import (
     PROJECTED_SIZES,
     Projected,
@@ -49,10 +47,6 @@ def _compositor(device: torch.device):
     return composite_cpu if gpu.kind_of(device) == "cpu" else composite_cuda
 
 
-def _projector(device: torch.device) -> Callable[..., None]:
-    return project_on_lanes if gpu.kind_of(device) == "cpu" else project_on_threads
-
-
 def _schema(record: type) -> str:
     """The fields of a named tuple of numbers, as arguments of an operator."""
     return ", ".join(f"{kind.__name__} {name}" for name, kind in get_type_hints(record).items())
@@ -69,7 +63,7 @@ def project(means, quats, scales, covars, opacities, colors, viewmats, Ks, *opti
     """``project_forward`` as an operator; the options are those of ``ProjectionOptions``."""
     inputs = means, quats, scales, covars, opacities, colors, viewmats, Ks
     params = projection_params(ProjectionOptions(*options))
-    p = project_forward(inputs, params, _projector(means.device))
+    p = project_forward(inputs, params)
     return p.means2d, p.conics, p.depths, p.view_opacities, p.extents, p.status
 
 
@@ -87,9 +81,8 @@ def _(means, quats, scales, covars, opacities, colors, viewmats, Ks, *options):
     f"{_schema(ProjectionOptions)}) -> Tensor[]",
 )
 def _project_vjp(inputs, conics, status, cotangents, wanted, *options):
-    run = vjp_on_lanes if gpu.kind_of(conics.device) == "cpu" else vjp_on_threads
     params = projection_params(ProjectionOptions(*options))
-    grads = project_backward(inputs, params, conics, status, cotangents, wanted, run)
+    grads = project_backward(inputs, params, conics, status, cotangents, wanted)
     return [g for g in grads if g is not None]
 
 

@@ -1,11 +1,13 @@
 """3D Gaussians to 2D: culling, the EWA projection, and its gradient (README.md §1 and §4).
 
-The arguments and kernels of both devices, which ``cpu/`` and ``cuda/`` launch.
+``project.h`` has the code of both devices. On a CPU sixteen Gaussians are lanes, in the forward
+pass of one view. On CUDA each (view, Gaussian) has a thread. The gradient's lanes or thread loop
+over the views: their sums are then in a fixed order.
 """
 
 import functools
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Any, NamedTuple
 
@@ -13,11 +15,14 @@ import torch
 import warp as wp
 from torch import Tensor
 
+from ..runtime import gpu
+from ..runtime.launch import launch
 from ..runtime.memory import empty
 from ..runtime.native import constants, native, native_kernel
 from ..runtime.views import StructValue, as_struct, filled, struct, struct_of
 from .constants import COMPENSATION_MIN, CONIC_MAX, FRUSTUM_MARGIN, RADIUS_MAX, TILE
 
+_HERE = Path(__file__).parent
 # Status of a (view, Gaussian).
 VISIBLE, NEAR, FAR, NOT_FINITE, TRANSPARENT, OUTSIDE, SMALL = range(7)
 STATUS_NAMES = ("visible", "near", "far", "not_finite", "transparent", "outside", "small")
@@ -75,6 +80,9 @@ class Projected(NamedTuple):
     status: Annotated[Any, wp.array[wp.int32]] = None
 
 
+# By device, the header of its lanes and the Gaussians of a task.
+LANES = {"cpu": (_HERE / "cpu" / "project.h", 512), "cuda": (_HERE / "cuda" / "project.h", 1)}
+_PIECES_PER_THREAD = 8  # of a CPU; those that are culled cost less
 PROJECTED_SIZES = ((2,), (3,), (), (), (2,))  # of ``Projected``'s floats, after [B, V, N]
 
 
@@ -141,20 +149,15 @@ def _kernels(header: Path, run: int, covars: bool, original: bool) -> tuple[Any,
     return project, project_vjp
 
 
-def projection_kernels(
-    header: Path, run: int, params: ProjectionParams, scene: StructValue
-) -> tuple[Any, Any]:
-    """The kernels of the projection and of its gradient, of the kind that a launch needs.
+def _run(of: int, rows: int, num: int, arguments: list, device: torch.device) -> None:
+    """Launch the projection, 0, or its gradient, 1, of ``num`` Gaussians in each of so many rows.
 
-    Covariances and the original have theirs, for fewer registers.
-
-    Args:
-        header: a device's ``project.h``.
-        run: Gaussians of a task.
-        params: of the launch.
-        scene: the Gaussians and cameras, a ``Scene``.
+    Covariances and the original's conventions have kernels of their own, for fewer registers.
     """
-    return _kernels(header, run, scene.values[3] is not None, bool(params.original))
+    (header, run), params, scene = LANES[gpu.kind_of(device)], *arguments[2:4]
+    kernel = _kernels(header, run, scene.values[3] is not None, bool(params.original))[of]
+    pieces = _PIECES_PER_THREAD * torch.get_num_threads()
+    launch(kernel, rows * -(-num // run), arguments, [], device, pieces=pieces)
 
 
 def projection_params(options: ProjectionOptions) -> ProjectionParams:
@@ -169,9 +172,7 @@ def empty_on(device: torch.device, shape: Sequence[int], dtype: torch.dtype) -> 
     return torch.empty(*shape, dtype=dtype, device=device)
 
 
-def project_forward(
-    inputs: Sequence[Any], params: ProjectionParams, run: Callable[..., None]
-) -> Projected:
+def project_forward(inputs: Sequence[Any], params: ProjectionParams) -> Projected:
     """Project objects of N Gaussians into V views each; float32, contiguous tensors.
 
     Args:
@@ -181,7 +182,6 @@ def project_forward(
             to cull values that are not finite; viewmats ``[.., V, 4, 4]`` and Ks
             ``[.., V, 3, 3]``.
         params: from ``projection_params``.
-        run: launches the device's kernel.
     """
     *gaussians, colors, viewmats, Ks = inputs
     shape, num, device = viewmats.shape[:-2], colors.shape[-2], colors.device
@@ -193,7 +193,7 @@ def project_forward(
         scene = StructValue(Scene, *gaussians, viewmats, Ks)
         per_view = int(colors.dim() > gaussians[0].dim())
         arguments = [shape[-1], num, params, scene, per_view, colors.flatten(0, -2)]
-        run(shape.numel(), num, [*arguments, as_struct(projected)], device)
+        _run(0, shape.numel(), num, [*arguments, as_struct(projected)], device)
     return projected
 
 
@@ -204,7 +204,6 @@ def project_backward(
     status: Tensor,
     cotangents: Sequence[Tensor],
     wanted: Sequence[bool],
-    run: Callable[..., None],
 ) -> list[Tensor | None]:
     """Gradients of ``project_forward`` by means, quats, scales, covars, opacities and viewmats.
 
@@ -215,8 +214,6 @@ def project_backward(
         status: as returned forward.
         cotangents: of means2d, conics, depths and view_opacities; contiguous.
         wanted: True for the needed gradients of the six; the others are None.
-        run: launches the device's kernel; the last argument is the gradient of viewmats, by
-            Gaussians ``[B * V, N, 12]``, or None.
     """
     *gaussians, viewmats, Ks = inputs
     (*lead, views, num), means = status.shape, gaussians[0]
@@ -230,15 +227,16 @@ def project_backward(
         else torch.zeros_like(x)
         for x, want in zip(gaussians, wanted)
     ]
-    v_viewmats = means.new_zeros(batch * views, num, 12) if wanted[5] else None
+    v_viewmats = means.new_zeros(batch * views, num, 12) if wanted[5] else None  # by Gaussians
     if status.numel():
         arguments = [
             *(views, num, params, StructValue(Scene, *gaussians, viewmats, Ks)),
             as_struct(Projected(conics=conics, status=status)),
             as_struct(Projected(*cotangents)),
             StructValue(Scene, *grads, None, None),
+            v_viewmats,
         ]
-        run(batch, num, arguments, v_viewmats)
+        _run(1, batch, num, arguments, means.device)
     if v_viewmats is not None:
         v_viewmats = v_viewmats.sum(1).view(*lead, views, 3, 4)
         v_viewmats = torch.nn.functional.pad(v_viewmats, (0, 0, 0, 1))

@@ -402,15 +402,16 @@ def launch(
     outputs: Sequence,
     device: torch.device,
     threads: int | None = None,
+    pieces: int | None = None,
     block_dim: int = 128,
 ) -> None:
     """Launches a plain kernel whose first parameter is ``offset``; with ``dim`` 0, does nothing.
 
-    The threads are as in ``parallel_launch``, on a CPU; ``block_dim`` is for CUDA.
+    Threads and pieces are as in ``parallel_launch``, on a CPU; ``block_dim`` is for CUDA.
     """
     if dim == 0 or (not isinstance(dim, int) and 0 in dim):
         return
     if gpu.kind_of(device) == "cpu":
-        parallel_launch(kernel, dim, inputs, outputs, threads)
+        parallel_launch(kernel, dim, inputs, outputs, threads, pieces)
     else:
         cuda_launch(kernel, dim, [0, *inputs], outputs, device=device, block_dim=block_dim)

@@ -7,10 +7,8 @@ from helpers.raster import NAMES, leaves, make
 
 from gamba_warp.kernels.rasterize import Skip, autograd, rasterization
 from gamba_warp.kernels.rasterize.cpu import bin as bin_cpu
-from gamba_warp.kernels.rasterize.cpu.project import vjp_on_lanes
 from gamba_warp.kernels.rasterize.cuda import bin as bin_cuda
-from gamba_warp.kernels.rasterize.cuda.project import vjp_on_threads
-from gamba_warp.kernels.rasterize.projection import Projected
+from gamba_warp.kernels.rasterize.projection import LANES, Projected
 from gamba_warp.kernels.rasterize.skip import TILE_TEST
 from gamba_warp.kernels.rasterize.tiles import Tiling, make_grid
 
@@ -126,8 +124,8 @@ def test_gradient_of_the_projection_on_lanes(monkeypatch, rotated, unused, mode)
     scene["skip"] = Skip(unused=unused)
     upstream = torch.randn(2, 3, 60, 45, 4)
     made = []
-    for run in (vjp_on_lanes, vjp_on_threads):
-        monkeypatch.setattr(autograd, "vjp_on_lanes", run)
+    for lanes in (LANES["cpu"], LANES["cuda"]):
+        monkeypatch.setitem(LANES, "cpu", lanes)
         tensors = leaves(scene, torch.float32)
         tensors["viewmats"].requires_grad_()
         renders = rasterization(**tensors, render_mode="RGB+ED", rasterize_mode=mode)[0]
