@@ -207,8 +207,8 @@ def read_config(path: Path) -> tuple[GambaConfig, str | None]:
     with _opened(path) as file:
         metadata = file.metadata() or {}
     if metadata.get("format") != FORMAT or "config" not in metadata:
-        found = "".join(filter(str.isprintable, metadata.get("format", "none")[:40]))
-        raise UserError(f"{path}: not a Gamba checkpoint (format {found}, not {FORMAT})")
+        stated = "".join(filter(str.isprintable, metadata.get("format", "none")[:40]))
+        raise UserError(f"{path}: not a Gamba checkpoint (format {stated}, not {FORMAT})")
     return GambaConfig.from_json(metadata["config"], str(path)), metadata.get("encoder_sha256")
 
 

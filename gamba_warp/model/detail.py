@@ -302,8 +302,8 @@ def _correct(
         color = want[..., :3] - want[..., 3:] * out.rgb[0] / out.alpha[0].clamp_min(FAINT)
         logits = torch.logit(children.opacities, 1e-4)
         for step, fraction in ((detail // 2, 1 - SMALL_FRACTION), (detail, SMALL_FRACTION)):
-            found = render(both, camera.resized(size // step, size // step)).alpha[0, ..., 0]
-            missing = F.avg_pool2d(image[:, 3:], step)[0, 0] - found
+            coverage = render(both, camera.resized(size // step, size // step)).alpha[0, ..., 0]
+            missing = F.avg_pool2d(image[:, 3:], step)[0, 0] - coverage
             logits = logits + fraction * OPACITY_GAIN * missing[row // step, column // step]
         children = replace(
             children,

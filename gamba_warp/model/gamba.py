@@ -147,8 +147,8 @@ class Gamba(nn.Module):
         if isinstance(self.decoder, RayDecoder):
             if foreground is None:
                 alpha = images[..., 3].cpu()
-                found = find_foreground(alpha, self.config, background_margin or 0)
-                foreground = found.to(images.device)
+                foreground = find_foreground(alpha, self.config, background_margin or 0)
+                foreground = foreground.to(images.device)
             return self._forward_rays(images, cameras, condition, foreground)
         tokens = self.tokens(images, cameras)
         if background_margin is not None:

@@ -117,7 +117,7 @@ def convert_released(
     Raises:
         UserError: a tensor is missing, unknown, not finite or of an impossible shape.
     """
-    found: dict[str, Tensor] = {}
+    tensors: dict[str, Tensor] = {}
     stored = torch.float32
     for name, value in _plain_names(state, path).items():
         if not name.startswith(_ROOT) or name.startswith(_ENCODER):
@@ -128,15 +128,15 @@ def convert_released(
         value = value.float()
         if not value.isfinite().all():
             raise UserError(f"{path}: '{name[:100]}' has numbers that are not finite")
-        found[name.removeprefix(_ROOT)] = value
+        tensors[name.removeprefix(_ROOT)] = value
     try:
-        config = _config(found, stored)
+        config = _config(tensors, stored)
         if config.depth != depth:
             raise UserError(
                 f"holds {config.depth} blocks, not {depth}: a part is missing, or it is another "
                 f"network, which --depth {config.depth} accepts"
             )
-        weights = _rename(found, config.depth)
+        weights = _rename(tensors, config.depth)
         shapes = {name: value.shape for name, value in weights.items()}
         outline(config).check_stored_state(shapes)  # before allocating memory
     except UserError as error:
@@ -145,9 +145,9 @@ def convert_released(
         raise UserError(f"{path}: not the released network: no tensor {error.args[0]!r}") from error
     except ValueError as error:
         raise UserError(f"{path}: not the released network: {error}") from error
-    if found:
-        first = sorted(found)[0][:100]
-        raise UserError(f"{path}: has an unknown tensor '{_ROOT}{first}' ({len(found)} in total)")
+    if tensors:
+        first = sorted(tensors)[0][:100]
+        raise UserError(f"{path}: has an unknown tensor '{_ROOT}{first}' ({len(tensors)} in total)")
     return config, weights
 
 
@@ -176,25 +176,25 @@ def released_names(depth: int) -> dict[str, str]:
     return names
 
 
-def _shape(found: dict[str, Tensor], name: str, axes: int) -> list[int]:
-    shape = list(found[name].shape)
+def _shape(tensors: dict[str, Tensor], name: str, axes: int) -> list[int]:
+    shape = list(tensors[name].shape)
     if len(shape) != axes:
         raise ValueError(f"'{name}' has shape {shape}, not {axes} axes")
     return shape
 
 
-def _config(found: dict[str, Tensor], stored: torch.dtype) -> GambaConfig:
+def _config(tensors: dict[str, Tensor], stored: torch.dtype) -> GambaConfig:
     """Preset at the sizes of the tensors, with their points, stored in the given dtype."""
-    width, _, patch, _ = _shape(found, "stem_layer.weight", 4)
-    tokens, _ = _shape(found, "transformer.pos_embed", 2)
+    width, _, patch, _ = _shape(tensors, "stem_layer.weight", 4)
+    tokens, _ = _shape(tensors, "transformer.pos_embed", 2)
     block = _BLOCK.format(0)
-    _, channels = _shape(found, block + "cond_affine.weight", 2)
-    inner, states = _shape(found, block + "mamba_block.mixer.A_log", 2)
-    _, _, taps = _shape(found, block + "mamba_block.mixer.conv1d.weight", 3)
-    _, rank = _shape(found, block + "mamba_block.mixer.dt_proj.weight", 2)
-    hidden, _ = _shape(found, "decoder.mlp_net.layers.0.weight", 2)
-    bins = _shape(found, _COORDS, 2)[1]
-    points = found.pop(_COORDS)
+    _, channels = _shape(tensors, block + "cond_affine.weight", 2)
+    inner, states = _shape(tensors, block + "mamba_block.mixer.A_log", 2)
+    _, _, taps = _shape(tensors, block + "mamba_block.mixer.conv1d.weight", 3)
+    _, rank = _shape(tensors, block + "mamba_block.mixer.dt_proj.weight", 2)
+    hidden, _ = _shape(tensors, "decoder.mlp_net.layers.0.weight", 2)
+    bins = _shape(tensors, _COORDS, 2)[1]
+    points = tensors.pop(_COORDS)
     limit = _decimal(points[0, -1].to(stored)) if points.numel() else 0.0
     even = torch.linspace(-limit, limit, bins, dtype=torch.float32)
     # Rounding moves the evenly spaced points by at most half a unit in the last place of the
@@ -208,7 +208,7 @@ def _config(found: dict[str, Tensor], stored: torch.dtype) -> GambaConfig:
         raise ValueError(f"'transformer.pos_embed' has {tokens} tokens, not four for each patch")
     if channels not in _VITS:
         raise ValueError(f"'{block}cond_affine.weight' takes {channels} channels, not DINOv2's")
-    names = (re.match(r"transformer\.layers\.(\d{1,4})\.", name) for name in found)
+    names = (re.match(r"transformer\.layers\.(\d{1,4})\.", name) for name in tensors)
     depth = 1 + max(int(match[1]) for match in names if match)
     fields = vars(PRESETS["released"]) | {
         "image_size": grid * patch,
@@ -233,9 +233,9 @@ def _decimal(value: Tensor) -> float:
     return next(x for x in numbers if float(torch.tensor(x).to(value.dtype)) == float(value))
 
 
-def _rename(found: dict[str, Tensor], depth: int) -> dict[str, Tensor]:
-    """Move their tensors out of ``found``, with our names and in our world."""
-    weights = {ours: found.pop(theirs) for theirs, ours in released_names(depth).items()}
+def _rename(tensors: dict[str, Tensor], depth: int) -> dict[str, Tensor]:
+    """Move their tensors out of ``tensors``, with our names and in our world."""
+    weights = {ours: tensors.pop(theirs) for theirs, ours in released_names(depth).items()}
     for n in range(depth):
         weights[f"blocks.{n}.mamba.conv_weight"] = weights[f"blocks.{n}.mamba.conv_weight"][:, 0]
     stem = weights["tokens.patchify.weight"].clone()

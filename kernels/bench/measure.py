@@ -325,7 +325,7 @@ def machine(settings: Settings) -> dict:
 
 def saved_bytes(forward: Callable[[], object], inputs: Iterable[torch.Tensor]) -> int:
     """Count the bytes that a forward pass keeps for its backward, without the inputs."""
-    own = {x.untyped_storage().data_ptr() for x in inputs}
+    given = {x.untyped_storage().data_ptr() for x in inputs}
     seen: dict[int, int] = {}
 
     def pack(x: torch.Tensor) -> torch.Tensor:
@@ -335,7 +335,7 @@ def saved_bytes(forward: Callable[[], object], inputs: Iterable[torch.Tensor]) -
     with torch.autograd.graph.saved_tensors_hooks(pack, lambda x: x):
         result = forward()
     del result
-    return sum(size for pointer, size in seen.items() if pointer not in own)
+    return sum(size for pointer, size in seen.items() if pointer not in given)
 
 
 def variant(case: Case, name: str, direction: str = "forward", **changes: Any) -> Variant:

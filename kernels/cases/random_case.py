@@ -160,22 +160,22 @@ def run_case(op: Op, case: RandomCase, device: torch.device) -> Outcome:
     """
     case = case._replace(options=op.plain | case.options)
     try:
-        found = [op.evaluate(case, device, 0)]
-        if not found[0].over:
-            return found[0]
-        found += [op.evaluate(case, device, trial) for trial in range(1, TRIALS)]
-        found.sort(key=lambda o: o.worst.ratio if o.worst else 0.0)
-        bad = next((o for o in found if o.faults or o.nonfinite), None)
-        by_result = list(zip(*(o.comparisons for o in found)))
+        outcomes = [op.evaluate(case, device, 0)]
+        if not outcomes[0].over:
+            return outcomes[0]
+        outcomes += [op.evaluate(case, device, trial) for trial in range(1, TRIALS)]
+        outcomes.sort(key=lambda o: o.worst.ratio if o.worst else 0.0)
+        bad = next((o for o in outcomes if o.faults or o.nonfinite), None)
+        by_result = list(zip(*(o.comparisons for o in outcomes)))
         steep = any(c.noise and c.ratio > 1 for results in by_result for c in results)
         for ratios in ([c.ratio for c in results] for results in by_result):
             steep |= max(ratios) > max(1.0, STEEP_RANGE * min(ratios))
-        middle = found[TRIALS // 2]
+        middle = outcomes[TRIALS // 2]
         if bad or not (middle.over and steep):
             return bad or middle
         least = replace(middle, steep=True)
         more = (op.evaluate(case, device, trial) for trial in range(TRIALS, STEEP_TRIALS))
-        for other in chain(found, more):
+        for other in chain(outcomes, more):
             if other.faults or other.nonfinite:
                 return other
             pairs = zip(least.comparisons, other.comparisons)

@@ -95,8 +95,8 @@ def scan_case(
 
     def reference(*, B: Tensor, C: Tensor, **rest) -> Tensor:
         if B.dim() == 4:  # a channel's own group; every chosen channel becomes a group of one
-            own = chosen // (width // B.shape[2])
-            B, C = B[:, :, own], C[:, :, own]
+            group = chosen // (width // B.shape[2])
+            B, C = B[:, :, group], C[:, :, group]
         options = {"delta_softplus": softplus, "initial_state": state}
         return selective_scan_reference(B=B, C=C, **options, **rest)[0]
 

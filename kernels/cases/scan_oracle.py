@@ -147,13 +147,13 @@ def of_sequences(
     """
     if cuts is None:
         return function(x)
-    found = []
+    results = []
     for s, (i, j) in enumerate(cuts.unfold(0, 2, 1).tolist()):
         place = {k: (slice(None), slice(None), slice(i, j)) for k in TOKENS}
         place |= {"initial_state": (slice(None), slice(s, s + 1))}
-        own = {k: t if t is None or k not in place else t[place[k]] for k, t in x.items()}
-        found.append(function(own))
-    outs, lasts = zip(*found)
+        part = {k: t if t is None or k not in place else t[place[k]] for k, t in x.items()}
+        results.append(function(part))
+    outs, lasts = zip(*results)
     return torch.cat(outs, 2), torch.cat(lasts, 1)
 
 

@@ -68,10 +68,10 @@ class Entry:
 
     def command(self) -> Any:
         """The recorded command, a copy for each thread, to be changed before it is launched."""
-        own = getattr(self._own, "command", None)
-        if own is None:
-            own = self._own.command = copy.copy(self._command)
-        return own
+        command = getattr(self._own, "command", None)
+        if command is None:
+            command = self._own.command = copy.copy(self._command)
+        return command
 
     def pack(self, arguments: list) -> ctypes.Structure:
         """The arguments as the compiled function takes them; an array that is None is empty."""

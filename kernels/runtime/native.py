@@ -100,9 +100,9 @@ def native_kernel(
         f"    {indices} = wp.tid()\n"
         f"    {name}_native(offset + {indices}, {names})\n"
     )
-    own = dict.fromkeys(map(str.strip, indices.split(",")), int)
+    native_types = dict.fromkeys(map(str.strip, indices.split(",")), int)
     every = {"offset": int, **arguments}
-    return _kernel(name, source, text, own | arguments, every, header, **options)
+    return _kernel(name, source, text, native_types | arguments, every, header, **options)
 
 
 def cuda_kernel(
@@ -138,19 +138,25 @@ def cuda_kernel(
         f"    {name}_native(index, lane, shared, {names})\n"
     )
     memory: Any = wp.tile[float, shared]  # pyright: ignore[reportIndexIssue] (in its stub a function)
-    own = {"index": int, "lane": int, "shared": memory, **arguments}
+    native_types = {"index": int, "lane": int, "shared": memory, **arguments}
     text = f"{function}(index, lane, shared.data.ptr, {names});"
     options = {"launch_bounds": bounds, "grid_stride": False}
-    return _kernel(name, source, text, own, arguments, header, **options)
+    return _kernel(name, source, text, native_types, arguments, header, **options)
 
 
 def _kernel(
-    name: str, source: str, text: str, own: dict, arguments: dict, header: str, **options: Any
+    name: str,
+    source: str,
+    text: str,
+    native_types: dict,
+    arguments: dict,
+    header: str,
+    **options: Any,
 ) -> Any:
     """The kernel of a source, which calls the C++ ``text`` as ``{name}_native``.
 
     Args:
-        own: types of the arguments of the C++.
+        native_types: of the arguments of the C++.
         arguments: of those of the kernel.
         options: of ``wp.kernel``.
     """
@@ -160,7 +166,7 @@ def _kernel(
     namespace: dict[str, Any] = {"__name__": __name__, "wp": wp}
     exec(compile(source, file, "exec"), namespace)
     native, kernel = namespace[f"{name}_native"], namespace[name]
-    native.__annotations__, kernel.__annotations__ = own, arguments
+    native.__annotations__, kernel.__annotations__ = native_types, arguments
     namespace[f"{name}_native"] = wp.func_native(text)(native)
     build = wp.ModuleBuildOptions(extra_cpu_preamble=header, extra_cuda_preamble=header)
     options["module_options"] = {"extra_build_options": build}

@@ -32,10 +32,10 @@ def box_of_windows(unequal: Tensor) -> tuple[slice, slice] | None:
     """The rows and columns of all windows that hold a True of ``[H, W]``; or None."""
     sides = []
     for axis in (1, 0):
-        found = unequal.any(axis).nonzero()[:, 0].tolist()
-        if not found:
+        rows = unequal.any(axis).nonzero()[:, 0].tolist()
+        if not rows:
             return None
-        sides.append(slice(max(0, found[0] - EDGE), found[-1] + EDGE + 1))
+        sides.append(slice(max(0, rows[0] - EDGE), rows[-1] + EDGE + 1))
     return sides[0], sides[1]
 
 

@@ -73,9 +73,9 @@ def _plain(value: Any) -> Any:
 def _table(rows: Sequence[dict]) -> str:
     def cells(r: dict) -> Iterator[str]:
         yield from (r["op"], r["kind"], str(r["cases"]))
-        for found in (r["forward"], r["gradient"]):
-            yield f"{found['error']:.1e}" if found["error"] else "0"
-            yield found["of"].removeprefix("gradient of ")
+        for errors in (r["forward"], r["gradient"]):
+            yield f"{errors['error']:.1e}" if errors["error"] else "0"
+            yield errors["of"].removeprefix("gradient of ")
         yield f"{r['ratio']:.2f}"
         yield f"{r['undecided'] / r['pixels']:.2%}" if r["pixels"] else ""
         yield from (str(r[name]) for name in ("steep", "nonfinite", "failures"))
@@ -139,7 +139,7 @@ class StressRun:
     def _take_turn(
         self, op: Op, turn: int, cases: int | None, until: float, say: Callable[[str], None]
     ) -> None:
-        found: list[
+        failing: list[
             tuple[RandomCase, Outcome]
         ] = []  # failing ones, each smaller than the one before
 
@@ -149,12 +149,12 @@ class StressRun:
                 raise _Stop
             started = time.monotonic()
             outcome = run_case(op, case, self._device)
-            if not found:
+            if not failing:
                 self._count(case, outcome, time.monotonic() - started)
             if failure := outcome.failure():
-                if not found:
+                if not failing:
                     until = time.monotonic() + _SHRINK
-                found.append((case, outcome))
+                failing.append((case, outcome))
                 say("shrinking a failing case")
                 raise _FAILURES[failure["what"]]
             say(f"worst {max(r['ratio'] for r in self._rows.values()):.2f} of its limit")
@@ -174,17 +174,17 @@ class StressRun:
         except (_Stop, *_FAILURES.values()):
             pass
         finally:
-            if found:
-                text, case = failure_text(*found[-1]), found[-1][0]._asdict()
+            if failing:
+                text, case = failure_text(*failing[-1]), failing[-1][0]._asdict()
                 self.failures.append({"text": text, "case": case})
 
     def _count(self, case: RandomCase, outcome: Outcome, seconds: float) -> None:
         failed = outcome.failure() is not None
-        found = vars(outcome) | {"cases": 1, "nonfinite": outcome.nonfinite, "failures": failed}
+        sums = vars(outcome) | {"cases": 1, "nonfinite": outcome.nonfinite, "failures": failed}
         for key in ((case.op, "all"), (case.op, case.kind)):
             row = self._rows.setdefault(key, _row(*key))
             for name in _SUMS:
-                row[name] += (found | {"seconds": seconds})[name]
+                row[name] += (sums | {"seconds": seconds})[name]
             for c in outcome.comparisons:
                 row["ratio"] = max(row["ratio"], c.ratio)
                 which = "gradient" if c.name.startswith("gradient") else "forward"

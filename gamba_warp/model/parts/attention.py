@@ -83,11 +83,11 @@ class AttentionBlock(Block):
         first = blocks[0]
         assert isinstance(first, AttentionBlock)
         rows = 2 * prefix.shape[-1]
-        found = product(prefix, stacked(blocks, "kvq_proj.weight", rows))
-        found = found + stacked(blocks, "kvq_proj.bias", rows)
+        pairs = product(prefix, stacked(blocks, "kvq_proj.weight", rows))
+        pairs = pairs + stacked(blocks, "kvq_proj.bias", rows)
         return [
             Memory(*(_by_head(half, first.heads) for half in both.chunk(2, dim=-1)))
-            for both in found.unbind(2)
+            for both in pairs.unbind(2)
         ]
 
 

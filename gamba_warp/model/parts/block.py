@@ -144,15 +144,15 @@ def run_blocks(
     if tokens.device.type == "cpu" and not gradients and first.in_segments:
         segments = list(tokens.split(SEGMENT, dim=1))
     for s, segment in enumerate(segments):
-        own, keep = packed, s + 1 < len(segments)
+        in_segment, keep = packed, s + 1 < len(segments)
         if packed is not None and len(segments) > 1:
             # The state of an image without tokens in this segment is unchanged.
-            own = Packed.of((packed.cu_seqlens - start).clamp(0, segment.shape[1]))
+            in_segment = Packed.of((packed.cu_seqlens - start).clamp(0, segment.shape[1]))
         start += segment.shape[1]
         for i, block in enumerate(blocks):
             run = block
             if checkpointing and gradients:
                 run = partial(checkpoint, block, use_reentrant=False)
-            segment, states[i] = run(segment, states[i], own, keep)
+            segment, states[i] = run(segment, states[i], in_segment, keep)
         segments[s] = segment
     return torch.cat(segments, dim=1) if len(segments) > 1 else segments[0]

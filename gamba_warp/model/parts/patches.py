@@ -165,9 +165,9 @@ def find_foreground(alpha: Tensor, config: GambaConfig, margin: int = 0) -> Fore
     patch_of[positions] = torch.arange(len(positions))[:, None]
     borders = F.pad(config.num_orders * near.sum(1).cumsum(0), (1, 0))
     cell = (F.max_pool2d(mask.float()[:, None], size // count)[:, 0] > 0).nonzero().T
-    own = torch.zeros(near.shape, dtype=torch.int64)
-    own[image, position] = torch.arange(len(position))
-    among = own[cell[0], cell[1] // count * side + cell[2] // count]
+    numbers_of = torch.zeros(near.shape, dtype=torch.int64)
+    numbers_of[image, position] = torch.arange(len(position))
+    among = numbers_of[cell[0], cell[1] // count * side + cell[2] // count]
     counts = torch.bincount(cell[0], minlength=len(alpha))
     first = counts.max() * torch.arange(len(counts)) - counts.cumsum(0) + counts
     return Foreground(
@@ -190,9 +190,9 @@ def _box(grid: Tensor) -> tuple[int, int, int, int]:
     """Return first row and column, and those behind the last, of a box with all patches."""
     begins, ends = [], []
     for axis, side in enumerate(grid.shape):
-        found = grid.any(1 - axis).nonzero()[:, 0].tolist() or [0]
-        length = min(side, math.ceil((found[-1] + 1 - found[0]) / _BOX) * _BOX)
-        begins.append(min(found[0], side - length))
+        filled = grid.any(1 - axis).nonzero()[:, 0].tolist() or [0]
+        length = min(side, math.ceil((filled[-1] + 1 - filled[0]) / _BOX) * _BOX)
+        begins.append(min(filled[0], side - length))
         ends.append(begins[-1] + length)
     return begins[0], begins[1], ends[0], ends[1]
 

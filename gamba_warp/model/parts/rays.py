@@ -138,7 +138,7 @@ class RayDecoder(nn.Module):
         if pixels.device.type != "cpu" or not foreground.boxes:
             image, row, column = foreground.cell
             return self.stem(pixels).permute(0, 2, 3, 1)[image, row, column]
-        count, found = self.config.ray_cells, []
+        count, values = self.config.ray_cells, []
         step, side = self.config.patch_size // count, self.config.grid_size * count
         cells = foreground.cell[1:, : sum(foreground.counts)]
         positions = (each.split(foreground.counts) for each in cells)
@@ -148,8 +148,8 @@ class RayDecoder(nn.Module):
             )
             cut = image[..., top * step : bottom * step, left * step : right * step]
             rows = self.stem(cut)[0].flatten(1).T
-            found.append(rows.index_select(0, (row - top) * (right - left) + column - left))
-        return F.pad(torch.cat(found), (0, 0, 0, len(foreground.number) - cells.shape[1]))
+            values.append(rows.index_select(0, (row - top) * (right - left) + column - left))
+        return F.pad(torch.cat(values), (0, 0, 0, len(foreground.number) - cells.shape[1]))
 
     def _activated(
         self, out: Tensor, colors: Tensor, alpha: Tensor, cell: Tensor, cameras: Cameras

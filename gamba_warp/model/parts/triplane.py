@@ -65,14 +65,14 @@ def query_planes(planes: Tensor, points: Tensor) -> Tensor:
         ``[B, N, 3C]``, the planes one after the other.
     """
     coordinates = torch.stack([points[..., list(axes)] for axes in AXES], 1)
-    found = F.grid_sample(
+    sampled = F.grid_sample(
         planes.flatten(0, 1),
         coordinates.flatten(0, 1)[:, None],
         mode="bilinear",
         padding_mode="border",
         align_corners=False,
     )
-    return found[:, :, 0].unflatten(0, (-1, 3)).permute(0, 3, 1, 2).flatten(2)
+    return sampled[:, :, 0].unflatten(0, (-1, 3)).permute(0, 3, 1, 2).flatten(2)
 
 
 class TriplaneDecoder(GaussianDecoder):

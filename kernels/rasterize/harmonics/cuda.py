@@ -81,8 +81,8 @@ def _leaves(degree: int, channels: int) -> SimpleNamespace:
                     return False
         return True
 
-    found = dict(column=column, part=part, basis=basis, slopes=slopes, load=load, store=store)
-    return SimpleNamespace(group=group, used_are_finite=used_are_finite, **found)
+    functions = dict(column=column, part=part, basis=basis, slopes=slopes, load=load, store=store)
+    return SimpleNamespace(group=group, used_are_finite=used_are_finite, **functions)
 
 
 @functools.cache

@@ -99,13 +99,13 @@ class Layout:
         else:
             self.segment = self.length
             b, begin, end = packed.unbind(1)
-            own = torch.tensor([*map(segment, (end - begin).tolist())], dtype=torch.int32)
-            counts = (-(-(end - begin) // own)).clamp(min=1)
+            lengths = torch.tensor([*map(segment, (end - begin).tolist())], dtype=torch.int32)
+            counts = (-(-(end - begin) // lengths)).clamp(min=1)
             self.segments = int(counts.max()) if len(counts) else 1
             step = torch.arange(self.segments, dtype=torch.int32)[:, None]
-            first = torch.minimum(begin + step * own, end)
-            place = slots(packed, self.length, chunk) + step * (own // chunk)
-            rows = b.expand_as(first), first, torch.minimum(first + own, end), place
+            first = torch.minimum(begin + step * lengths, end)
+            place = slots(packed, self.length, chunk) + step * (lengths // chunk)
+            rows = b.expand_as(first), first, torch.minimum(first + lengths, end), place
             self.rows = torch.stack(rows, 2).flatten(0, 1)
             self.last = -1
             if self.segments > 1:
