@@ -205,7 +205,7 @@ def test_a_whole_report(data, tmp_path, capsys):
 
 def test_what_cannot_be_had_is_listed(data, tmp_path, capsys):
     """A bad training image: the retrieval goes on. No training split: it is left out."""
-    (data / "flat" / "3.png").write_bytes(b"nothing")
+    (data / "flat" / "003.png").write_bytes(b"nothing")
     code, report = evaluate(data, tmp_path / "out")
     assert code == 1 and report["num_failed"] == 0
     assert [item["name"] for item in report["failures"]] == ["flat (retrieval)"]
