@@ -133,12 +133,12 @@ def test_training_loads_without_what_makes_objects(monkeypatch):
     code = WITHOUT.rpartition("cli.main")[0] + "import gamba_warp.train.batches"
     done = ran(python(), "-c", code)
     assert done.returncode == 0, done.stderr
-    from gamba_warp.train.data.pool import Pool, PoolOptions
+    from gamba_warp.train.data.pool import Pool
 
     real = versions.find_spec
     monkeypatch.setattr(versions, "find_spec", lambda n: n != "manifold3d" and real(n) or None)
     with pytest.raises(ModuleNotFoundError) as found:
-        Pool(PoolOptions(0, 0, 1, None), 0)
+        Pool(None, 0)
     assert found.value.name == "manifold3d"
 
 
