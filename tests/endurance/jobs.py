@@ -14,7 +14,7 @@ from gamba_warp.files import remove_folder, write_json
 from gamba_warp.formats.ply import save_ply
 from gamba_warp.images import save_image
 
-from .child import gamba, run_child
+from .child import gamba
 
 
 class Job(NamedTuple):
@@ -99,7 +99,7 @@ def training(world: Path, out: Path, steps: int) -> list[str]:
 
 def undisturbed(*words: object):
     """Run a command, which must succeed."""
-    end = run_child(gamba, *words)
+    end = gamba(*words)
     assert end.code == 0, end.said[-2000:]
     return end
 

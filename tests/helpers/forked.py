@@ -23,8 +23,11 @@ _ASKING = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
 
 @cache
-def python() -> str:
-    """Start the server, which ends with this process; return the path of the program."""
+def python(*more: str) -> str:
+    """Start the server, which ends with this process; return the path of the program.
+
+    ``more`` are further modules that it loads before the fork.
+    """
     import atexit
     import shlex
     import shutil
@@ -38,7 +41,7 @@ def python() -> str:
         listener.bind(address)
         listener.listen(100)
         server = subprocess.Popen(
-            [sys.executable, __file__, str(listener.fileno())],
+            [sys.executable, __file__, "--serve", str(listener.fileno()), *more],
             env=plain,
             pass_fds=[listener.fileno()],
             stdin=subprocess.PIPE,
@@ -164,12 +167,13 @@ def main() -> None:
     import importlib
     import threading
 
-    if len(sys.argv) > 2:
-        _ask(sys.argv[1], sys.argv[2:])
-    for name in _LIBRARIES:
+    place, *words = sys.argv[1:]
+    if place != "--serve":
+        _ask(place, words)
+    for name in (*_LIBRARIES, *words[1:]):
         importlib.import_module(name)
     gc.freeze()
-    code = _run(*_become(*_serve(socket.socket(fileno=int(sys.argv[1])))))
+    code = _run(*_become(*_serve(socket.socket(fileno=int(words[0])))))
     if isinstance(code, str):
         print(code, file=sys.stderr)
     with contextlib.suppress(OSError, ValueError):
