@@ -77,7 +77,7 @@ def doubled(mesh: Mesh) -> Mesh:
 def drift(mesh, damage=lambda mesh: mesh):
     """Return the IoU by rule of the damaged mesh's occupancy with that of the closed mesh."""
     grid = grid_around(mesh, resolution=16)
-    gt, broken = enclosed(mesh, grid), clean_mesh(damage(mesh)).mesh
+    gt, broken = enclosed(mesh, grid), clean_mesh(damage(mesh))[0]
     return {name: volume_iou(rule.fill(broken, grid), gt) for name, rule in RULES.items()}
 
 
