@@ -4,14 +4,15 @@ import copy
 import errno
 import math
 import os
-import subprocess
 import zipfile
 from pathlib import Path
 
 import pytest
 import torch
 from helpers import micro
+from helpers.children import ran
 from helpers.forked import python
+from helpers.nodes.processes import environment
 from helpers.refusals import refused
 
 from gamba_warp.model.checkpoint import load_model
@@ -95,9 +96,7 @@ def test_killed_while_saving_leaves_the_old_one(tmp_path, model):
         "checkpoint.torch.save = lambda *_: os.kill(os.getpid(), 9)\n"
         "checkpoint.save_checkpoint(run, 2, {'model': model}, {'a': 2}, keep=1)\n"
     )
-    path = os.pathsep.join([str(Path(micro.__file__).parents[1]), os.environ.get("PYTHONPATH", "")])
-    command = [python(), "-c", script, str(tmp_path)]
-    assert subprocess.run(command, env={**os.environ, "PYTHONPATH": path}).returncode == -9
+    assert ran(python(), "-c", script, tmp_path, env=environment()).returncode == -9
     assert names(tmp_path) == ["step_000001"]
     assert len(os.listdir(tmp_path / "checkpoints")) == 2, "the unfinished folder is there"
     assert read_state(find_checkpoint(tmp_path, "auto")) == {"a": 1}
