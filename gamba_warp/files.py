@@ -25,7 +25,6 @@ CHECKOUT = PACKAGE.parent
 # The shipped model and example images: two in an installed package, more in a checkout, which
 # also has the starter set's data.
 STARTER = PACKAGE / "starter" if (PACKAGE / "starter").is_dir() else CHECKOUT / "starter"
-CONFIG = "config.json"  # options of a command, in the folder of its results
 # Prefix of unfinished files. Commands ignore inputs whose names begin with a dot.
 PART = ".gamba-part-"
 _PART_NAME = re.compile(re.escape(PART) + "[a-z0-9_]{8}")

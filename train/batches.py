@@ -37,7 +37,7 @@ from gamba_warp.model.config import GambaConfig
 
 from .config import TrainConfig
 from .data.pool import VIEWS as MADE_VIEWS
-from .data.pool import Pool, PoolOptions
+from .data.pool import Pool
 from .data.poses import front_views
 from .data.samples import Batch, choose_views, draw_change, join, load_sample
 from .data.settings import VARIED_CAMERAS, Settings
@@ -375,13 +375,8 @@ class Batches:
             up="y",
             **VARIED_CAMERAS,
         )
-        options = PoolOptions(
-            seed=self.config.run.seed,
-            rank=world.rank,
-            world=world.size,
-            views=images,
-        )
-        self._procedural = Pool(options, math.floor(number * views.batch_size * views.procedural))
+        first = math.floor(number * views.batch_size * views.procedural)
+        self._procedural = Pool(images, first, world.rank, world.size)
 
     def _object(self, place: int) -> int:
         """Return the object of a place in the order; each epoch has its own permutation."""

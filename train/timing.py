@@ -74,12 +74,9 @@ class Step:
         self.ema = Ema(self.model, OptimConfig.ema)
         self.weights = term_weights(_LOSSES, Progress(1, 1.0, 0.5))
         objective = Objective({}, lpips and lpips.to(device), _LOSSES.lpips_crop, precision)
-        self.plain = make_step(self.model, self.optimizer, self.ema, objective)
-        self.step = self.plain
-        if self.graphs is not None:
-            self.step = make_step(
-                self.model, self.optimizer, self.ema, objective, graphs=self.graphs
-            )
+        parts = self.model, self.optimizer, self.ema, objective
+        self.plain = make_step(*parts)
+        self.step = make_step(*parts, graphs=self.graphs)
         views = orbit(90.0 * torch.arange(_VIEWS), 20.0, 1.8).expand(objects, -1, -1, -1)
         Ks = intrinsics(_SIZE, _SIZE).expand(objects, _VIEWS, 3, 3)
         size = config.image_size

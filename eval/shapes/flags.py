@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
-
 import numpy as np
 
 from gamba_warp.formats.parts import merged
@@ -22,19 +20,7 @@ FLAGS = {
 STRICT = tuple(flag for flag in FLAGS if flag != "open")  # refused by "strict"
 
 
-class CleanMesh(NamedTuple):
-    """A cleaned mesh, and the flags of the original.
-
-    Attributes:
-        mesh: without duplicate vertices, duplicate faces and faces without area; may be empty.
-        flags: names from ``FLAGS``, in their order.
-    """
-
-    mesh: Mesh
-    flags: list[str]
-
-
-def clean_mesh(mesh: Mesh, intersections: bool = False) -> CleanMesh:
+def clean_mesh(mesh: Mesh, intersections: bool = False) -> tuple[Mesh, list[str]]:
     """Merge equal vertices, drop faces without area and duplicate faces, and set flags.
 
     The surface does not change.
@@ -42,6 +28,10 @@ def clean_mesh(mesh: Mesh, intersections: bool = False) -> CleanMesh:
     Args:
         mesh: any mesh; without area the result has no face.
         intersections: look for faces that cut each other, too: 3 s for 110,000 faces.
+
+    Returns:
+        The mesh without duplicate vertices, duplicate faces and faces without area, perhaps empty;
+        the flags of the original, names from ``FLAGS`` in their order.
     """
     vertices, index = merged(mesh.vertices)
     faces = index[mesh.faces]
@@ -58,7 +48,7 @@ def clean_mesh(mesh: Mesh, intersections: bool = False) -> CleanMesh:
         found.add("duplicate")
     if intersections and len(kept.faces) and _cuts_itself(kept):
         found.add("selfintersecting")
-    return CleanMesh(kept, [flag for flag in FLAGS if flag in found])
+    return kept, [flag for flag in FLAGS if flag in found]
 
 
 def _edge_flags(mesh: Mesh) -> set[str]:

@@ -21,6 +21,7 @@ from ..files import output_folder, write_json, write_text
 from ..untrusted.ranges import Minutes, Seed, Threads, ranged
 from ..versions import used_versions
 
+What = tyro.conf.Positional[Annotated[tuple[str, ...], tyro.conf.arg(metavar="WHAT ...")]]
 # Suite -> the module with its ``tables(settings)``, imported when needed.
 BENCH = {
     "scan": "gamba_warp.kernels.bench.scan",
@@ -49,9 +50,7 @@ def choose(what: Sequence[str], known: Mapping[str, object]) -> list[str]:
 
 @ranged
 def bench_command(
-    what: tyro.conf.Positional[Annotated[tuple[str, ...], tyro.conf.arg(metavar="WHAT ...")]] = (
-        "all",
-    ),
+    what: What = ("all",),
     *,
     device: DeviceChoice = "auto",
     quick: bool = False,
@@ -125,9 +124,7 @@ def load_suite(op: str) -> ModuleType:
 
 @ranged
 def stress_command(
-    what: tyro.conf.Positional[Annotated[tuple[str, ...], tyro.conf.arg(metavar="WHAT ...")]] = (
-        "all",
-    ),
+    what: What = ("all",),
     *,
     seed: Seed = 0,
     minutes: Minutes | None = None,

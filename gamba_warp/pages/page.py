@@ -19,7 +19,6 @@ from ..images import to_uint8
 from ..trajectories.movies import SECONDS
 from ..trajectories.paths import Viewpoint
 from ..viewer.page import POLICY, viewer_page
-from .templates import render
 
 
 @dataclass
@@ -67,8 +66,16 @@ def write_page(path: str | Path, title: str, sections: Sequence[Section], text: 
     Raises:
         UserError: the file cannot be written.
     """
-    page = render(
-        "page.html",
+    import jinja2  # only when a page is made
+
+    templates = jinja2.Environment(
+        loader=jinja2.FileSystemLoader(Path(__file__).parent),
+        undefined=jinja2.StrictUndefined,
+        autoescape=True,  # all text but ``Markup``
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    page = templates.get_template("page.html").render(
         **{"title": title, "text": text, "sections": sections, "policy": POLICY},
         style=Markup((Path(__file__).parent / "page.css").read_text(encoding="utf-8")),
         **{"image": _image, "animation": _animation, "viewer": _viewer},

@@ -153,25 +153,26 @@ def test_a_doubted_cut_out_has_no_command_but_a_network(tmp_path, monkeypatch):
     assert cutting.cut_by_network(mended, options).mask[50, 40] > 0.9
 
 
-def test_words_of_the_command_line_are_not_for_the_page(tmp_path):
-    options = CutoutOptions(notify=lambda line: None)
-    save_image(tmp_path / "even.png", np.full((40, 50, 3), 0.5))
-    assert "--" not in cutting.cut_image(tmp_path / "even.png", "even.png", options).note
-    rgb = np.ones((60, 80, 3))
-    rgb[10:50, 20:60] = 0.8, 0.2, 0.1
-    rgb[20:40, 30:50] = 1
-    save_image(tmp_path / "ring.png", rgb)
-    note = cutting.cut_image(tmp_path / "ring.png", "ring.png", options).note
-    assert "with 1 enclosed area of it" in note and "--" not in note
-
-
-def test_enclosed_areas_are_cleared_and_filled(tmp_path):
+def ring(folder):
+    """An image of a red ring on white."""
     rgb = np.ones((60, 80, 3))
     rgb[10:50, 20:60] = 0.8, 0.2, 0.1
     rgb[20:40, 30:50] = 1  # a hole
     rgb[42:46, 30:50] = 0.95  # of another white: matter
-    save_image(tmp_path / "ring.png", rgb)
-    cut = cutting.cut_image(tmp_path / "ring.png", "ring.png", CutoutOptions())
+    save_image(folder / "ring.png", rgb)
+    return folder / "ring.png"
+
+
+def test_words_of_the_command_line_are_not_for_the_page(tmp_path):
+    options = CutoutOptions(notify=lambda line: None)
+    save_image(tmp_path / "even.png", np.full((40, 50, 3), 0.5))
+    assert "--" not in cutting.cut_image(tmp_path / "even.png", "even.png", options).note
+    note = cutting.cut_image(ring(tmp_path), "ring.png", options).note
+    assert "with 1 enclosed area of it" in note and "--" not in note
+
+
+def test_enclosed_areas_are_cleared_and_filled(tmp_path):
+    cut = cutting.cut_image(ring(tmp_path), "ring.png", CutoutOptions())
     assert cut.mask[30, 40] == 0 and cut.mask[44, 40] == 1 and "1 enclosed area" in cut.note
     cleared = cutting.switch_areas(cut)
     assert cleared.mask[30, 40] == 0 and cleared.mask[44, 40] == 0 and cleared.mask[15, 40] == 1

@@ -82,8 +82,8 @@ def test_a_name_does_not_say_that_a_file_is_compressed():
 def test_what_is_read_is_never_an_output(tmp_path):
     photo, mask, out = tmp_path / "photo.gif", tmp_path / "photo.html", tmp_path / "out"
     photo.touch(), mask.touch(), out.mkdir()
-    with pytest.raises(UserError, match="photo.gif: would be overwritten by an output"):
-        plan_outputs([photo], [".ply", ".gif"], tmp_path)
+    said = "photo.gif: would be overwritten by an output"
+    refused(said, plan_outputs, [photo], [".ply", ".gif"], tmp_path)
     refused(
         "photo.html: would be overwritten", plan_outputs, [photo], [".html"], tmp_path, [None, mask]
     )

@@ -11,6 +11,7 @@ from typing import Annotated
 import pytest
 import torch
 import tyro
+from helpers.children import ran
 from helpers.forked import python
 
 from gamba_warp import __version__, cli, versions
@@ -206,8 +207,7 @@ finally:
 
 @pytest.mark.parametrize("name", cli.COMMANDS)
 def test_every_command_explains_itself_at_once(name):
-    command = [sys.executable, "-c", HELP, *name.split()]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=120)
+    done = ran(sys.executable, "-c", HELP, *name.split())
     assert done.returncode == 0 and f"gamba {name}" in done.stdout
     seconds, *modules = done.stderr.split()
     heavy = {"torch", "warp", "numpy", "PIL", "imageio_ffmpeg", "kornia", "timm", "trimesh"}
@@ -235,8 +235,7 @@ runpy.run_module(module, run_name="__main__", alter_sys=True)
 
 @pytest.mark.parametrize("words", [["gamba_warp", "train"], ["gamba_warp.train"]], ids=" ".join)
 def test_ctrl_c_ends_training_in_one_line(tmp_path, words):
-    command = [python(), "-c", CTRL_C, *words, str(tmp_path), "--out", str(tmp_path / "run")]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=120)
+    done = ran(python(), "-c", CTRL_C, *words, tmp_path, "--out", tmp_path / "run")
     assert done.returncode == 130 and done.stderr == "gamba: interrupted\n"
 
 

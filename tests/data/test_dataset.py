@@ -9,8 +9,8 @@ import pytest
 import torch
 from helpers import micro
 from helpers.gobjaverse import ELEVATION, VIEWS, camera, write_object
-from helpers.micro import to_opengl
 from helpers.refusals import refused
+from helpers.views import to_opengl
 from PIL import Image
 
 from gamba_warp.cameras import orbit

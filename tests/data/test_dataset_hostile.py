@@ -7,8 +7,8 @@ import shutil
 import numpy as np
 import pytest
 import torch
-from helpers.micro import to_opengl
 from helpers.refusals import refused
+from helpers.views import to_opengl
 from PIL import Image
 
 from gamba_warp.cameras import orbit

@@ -14,6 +14,7 @@ from helpers import micro
 from helpers.disk import full_at
 from helpers.images import bytes_of
 from helpers.refusals import refused
+from helpers.views import to_opengl
 from hostile import seeds
 from PIL import Image
 
@@ -41,7 +42,7 @@ def write_object(folder, seed, depth=None):
             folder / f"{v}.png"
         )
         viewmat = orbit(torch.tensor([37.0 * v + seed]), 10.0 + v, 1.7)[0].double()
-        frame = {"file_path": f"{v}.png", "transform_matrix": micro.to_opengl(viewmat).tolist()}
+        frame = {"file_path": f"{v}.png", "transform_matrix": to_opengl(viewmat).tolist()}
         frame |= {"w": WIDTH, "h": HEIGHT, "fl_x": 11.3 + v, "cx": 6.7, "cy": 5.1}
         for key in ("depth", "back") if depth else ():
             steps = rng.integers(0, 9000, (HEIGHT, WIDTH))

@@ -18,12 +18,12 @@ _ENDS |= dict.fromkeys((".json", ".jsonl", ".md", ".csv"), b"\n")
 
 
 def contents(folder: Path) -> dict[str, bytes]:
-    """Files of a folder by their path in it, without leftovers."""
+    """Files of a folder by their path in it, without leftovers and TensorBoard's, named by time."""
     found = sorted(path for path in folder.rglob("*") if path.is_file())
-    named = ((path.relative_to(folder), path) for path in found)
+    named = {path.relative_to(folder): path for path in found if "tfevents" not in path.name}
     return {
         relative.as_posix(): path.read_bytes()
-        for relative, path in named
+        for relative, path in named.items()
         if not any(part.startswith(".") for part in relative.parts)
     }
 

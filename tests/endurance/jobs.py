@@ -7,6 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 import trimesh
+from ablation.fake import write_plan
 from helpers.released import make_released
 from helpers.views import cloud_of
 
@@ -14,7 +15,7 @@ from gamba_warp.files import remove_folder, write_json
 from gamba_warp.formats.ply import save_ply
 from gamba_warp.images import save_image
 
-from .child import gamba, run_child
+from .child import gamba
 
 
 class Job(NamedTuple):
@@ -99,7 +100,7 @@ def training(world: Path, out: Path, steps: int) -> list[str]:
 
 def undisturbed(*words: object):
     """Run a command, which must succeed."""
-    end = run_child(gamba, *words)
+    end = gamba(*words)
     assert end.code == 0, end.said[-2000:]
     return end
 
@@ -125,23 +126,13 @@ def make_world(folder: Path, commands: list[str]) -> None:
     points *= 0.4 / np.linalg.norm(points, axis=1, keepdims=True)
     save_ply(folder / "gaussians" / "ball.ply", cloud_of(points, 0.08, 0.95, rng.random((200, 3))))
     if "ablate" in commands:
-        write_json(folder / "plan.json", PLAN)
+        base = {"options": {"steps": 2, "batch_size": 2}}
+        chosen = {"split": "val", "objects": 1, "views": 3, "size": 16}
+        write_plan(folder, "model", name="plan", base=base, evaluation=chosen)
     if "data furniture" in commands:
         make_library(folder / "libraries", folder / "images" / "a.png")
     if "import-released" in commands:
         make_released(folder / "released")
-
-
-# An ablation of one row of a few steps.
-PLAN = {
-    "name": "small",
-    "title": "One row",
-    "seeds": [0],
-    "base": {"preset": "tiny", "options": {"steps": 2, "batch_size": 2}},
-    "evaluation": {"split": "val", "objects": 1, "views": 3, "size": 16},
-    "compare_with": "model",
-    "rows": [{"name": "model"}],
-}
 
 
 def make_library(folder: Path, icon: Path) -> None:

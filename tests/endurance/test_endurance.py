@@ -7,8 +7,6 @@ full disk is simulated by a limit on the size of a file (``RLIMIT_FSIZE``).
 import os
 import random
 import shutil
-import time
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -21,7 +19,7 @@ from gamba_warp.formats.ply import save_ply
 from gamba_warp.images import save_image
 from gamba_warp.train.checkpoint import damage, list_checkpoints
 
-from .child import gamba, run_child
+from .child import gamba
 from .folders import age, contents, is_whole, leftovers, lost
 from .jobs import JOBS, make_world, training, undisturbed
 
@@ -67,7 +65,7 @@ def test_killed_training_goes_on_to_the_same_bits(world, tmp_path):
         out = tmp_path / f"killed-{turn}"
         while not ended and tried < kills:
             after = rng.uniform(0, 0.7 * quiet.seconds)
-            end = run_child(gamba, *training(world, out, steps), kill_after=after)
+            end = gamba(*training(world, out, steps), kill_after=after)
             tried, hit, ended = tried + 1, hit + end.killed, end.code == 0
             assert ended or end.killed, f"it did not go on: {end.said[-2000:]}"
             left += len(leftovers(out)) if out.exists() else 0
@@ -87,7 +85,7 @@ def test_training_on_a_full_disk_keeps_its_checkpoint(world, tmp_path):
     for _ in range(FULL):
         before, steps = newest(out), steps + 4
         words = training(world, out, steps)
-        end = run_child(gamba, *words, file_limit=rng.randrange(largest))
+        end = gamba(*words, file_limit=rng.randrange(largest))
         hit += end.code != 0
         assert end.code == 0 or end.is_one_line, end.said[-2000:]
         assert newest(out) >= before
@@ -118,10 +116,10 @@ def test_a_disturbed_command_loses_nothing(world, tmp_path, name, fault):
         changed = [*words, *(job.other.split() if turn % 2 == 0 else ())]
         if fault == "SIGKILL":
             after = rng.uniform(0.02, 1.1) * first.seconds
-            end = run_child(gamba, *changed, kill_after=after)
+            end = gamba(*changed, kill_after=after)
             hit += end.killed
         else:
-            end = run_child(gamba, *changed, file_limit=rng.randrange(1, largest))
+            end = gamba(*changed, file_limit=rng.randrange(1, largest))
             hit += end.code != 0
             assert end.code == 0 or end.is_one_line, end.said[-2000:]
         assert not lost(before, contents(out))
@@ -147,8 +145,10 @@ def test_files_cut_short_are_not_whole(tmp_path):
 
 
 def test_children_are_killed_and_find_a_full_disk(tmp_path):
-    end = run_child(time.sleep, 60, kill_after=0.1)
-    assert end.killed and end.code == -9 and end.seconds < 5
-    end = run_child(Path.write_bytes, tmp_path / "a", bytes(9999), file_limit=5)
-    assert end.code == 1 and "File too large" in end.said
-    assert (tmp_path / "a").stat().st_size == 5
+    save_ply(tmp_path / "a.ply", some(9))
+    words = "stress", "scan", "--minutes", 1, "--device", "cpu", "--out", tmp_path
+    end = gamba(*words, kill_after=0.1)
+    assert end.killed and end.code == -9 and end.seconds < 30
+    words = "view", tmp_path / "a.ply", "--out", tmp_path / "a.html", "--no-open-browser"
+    end = gamba(*words, file_limit=5)
+    assert end.code == 2 and end.is_one_line and "File too large" in end.said

@@ -8,12 +8,12 @@ import pytest
 import torch
 import trimesh
 from helpers.micro import write_split
+from helpers.refusals import refused
 from helpers.views import eval_views, evaluated
 
 from gamba_warp.cameras import relative_to_reference
 from gamba_warp.cli import run
 from gamba_warp.data.dataset import open_dataset
-from gamba_warp.errors import UserError
 from gamba_warp.eval.shapes.pairs import find_pairs, open_objects
 from gamba_warp.eval.views.baselines import NearestView, TrainingMeshes
 from gamba_warp.files import STARTER
@@ -174,8 +174,8 @@ def test_what_contradicts_a_set_is_told(tmp_path, capsys):
     _, report = geometry(out, seen, tmp_path / "others", data, "--up", "z")
     assert report["warnings"] == [] and report["axes"]["gt"] == {"z-up": 1}
     meshes = TrainingMeshes(tmp_path / "others", open_dataset(data))
-    with pytest.raises(UserError, match="lamp.ply: not the mesh that DATA's lamp was"):
-        meshes.place(NearestView("lamp", 0, 0.0), 1.5)
+    said = "lamp.ply: not the mesh that DATA's lamp was"
+    refused(said, meshes.place, NearestView("lamp", 0, 0.0), 1.5)
 
 
 def test_who_is_missing_of_a_set(tmp_path):

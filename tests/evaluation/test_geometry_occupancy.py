@@ -1,13 +1,13 @@
 """Volume IoU of open meshes, and known answers."""
 
 import math
-import subprocess
 import sys
 from dataclasses import replace
 
 import numpy as np
 import pytest
 import trimesh
+from helpers.children import ran
 from helpers.meshes import as_mesh, cube
 
 from gamba_warp.eval.shapes import occupancy
@@ -77,7 +77,7 @@ def doubled(mesh: Mesh) -> Mesh:
 def drift(mesh, damage=lambda mesh: mesh):
     """Return the IoU by rule of the damaged mesh's occupancy with that of the closed mesh."""
     grid = grid_around(mesh, resolution=16)
-    gt, broken = enclosed(mesh, grid), clean_mesh(damage(mesh)).mesh
+    gt, broken = enclosed(mesh, grid), clean_mesh(damage(mesh))[0]
     return {name: volume_iou(rule.fill(broken, grid), gt) for name, rule in RULES.items()}
 
 
@@ -243,8 +243,7 @@ sys.exit(code)
 
 def test_five_million_points_in_memory(tmp_path):
     """Drawn from; with --points 5000000 it takes 2 GB and minutes."""
-    paths = [str(tmp_path / name) for name in ("many.ply", "box.stl")]
-    done = subprocess.run([sys.executable, "-c", MANY, *paths], capture_output=True, text=True)
+    done = ran(sys.executable, "-c", MANY, tmp_path / "many.ply", tmp_path / "box.stl")
     assert done.returncode == 0, done.stderr
     assert int(done.stdout.split("peak")[1]) < 4096, "MB"
 

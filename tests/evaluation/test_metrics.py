@@ -1,4 +1,3 @@
-import json
 import math
 from dataclasses import replace
 
@@ -8,7 +7,7 @@ import torch
 from helpers.views import around
 
 from gamba_warp.conventions import over_another, over_background
-from gamba_warp.eval.report import failure, intervals_of, make_report, mean_of, save_report
+from gamba_warp.eval.averages import intervals_of, mean_of
 from gamba_warp.eval.shapes.metrics import surface_metrics
 from gamba_warp.eval.shapes.protocol import PRESETS
 from gamba_warp.eval.shapes.shape import Points
@@ -78,21 +77,6 @@ def test_means_pass_over_what_is_not_there():
     assert mean_of(records) == {"x": 2.0, "nest": {"y": 2.0, "z": None}}
 
 
-def test_report_counts_failures(tmp_path):
-    objects = [
-        failure("z", ValueError("first line\nsecond line")),
-        {"name": "a", "status": "ok", "x": 2.0, "nest": {"y": 1.0}},
-    ]
-    save_report(make_report({"p": 1}, objects, {"v": "1"}, baselines={}), tmp_path)
-    report = json.loads((tmp_path / "report.json").read_text())
-    assert report["mean"] == {"x": 2.0, "nest": {"y": 1.0}}
-    assert report["failures"] == [{"name": "z", "reason": "first line"}]
-    assert [record["name"] for record in report["objects"]] == ["a", "z"]
-    assert (report["num_ok"], report["num_failed"]) == (1, 1)
-    lines = (tmp_path / "objects.csv").read_text().splitlines()
-    assert lines == ["name,status,x,nest.y,reason", "a,ok,2.0,1.0,", "z,failed,,,first line"]
-
-
 def test_interval_is_that_of_the_normal_law():
     """Of many objects: the mean, 1.96 standard errors to each side."""
     values = np.random.default_rng(3).normal(5, 2, 400)
@@ -123,19 +107,11 @@ def cameras():
     return around(torch.arange(VIEWS) * 70.0)
 
 
-def balls(*colors):
-    """Balls about the origin, each larger than the one before; all but the first are floaters."""
-    scales = 0.08 * torch.arange(1, len(colors) + 1)[:, None].expand(-1, 3)
-    opacities = torch.tensor([0.95] + [0.2] * (len(colors) - 1))
-    return Gaussians(torch.zeros(len(colors), 3), None, scales, opacities, torch.tensor(colors))
-
-
-RED, WHITE = [0.9, 0.1, 0.1], [1.0, 1.0, 1.0]
-
-
 def test_one_rendering_serves_all_grounds():
     """Compositing by alpha equals rendering on that background."""
-    scene = balls(RED, [0.2, 0.9, 0.4])
+    colors = torch.tensor([[0.9, 0.1, 0.1], [0.2, 0.9, 0.4]])
+    scales = torch.tensor([0.08, 0.16])[:, None].expand(-1, 3)
+    scene = Gaussians(torch.zeros(2, 3), None, scales, torch.tensor([0.95, 0.2]), colors)
     shown = render_views(scene, cameras())
     for grey in (1.0, 0.5, 0.0):
         with torch.no_grad():

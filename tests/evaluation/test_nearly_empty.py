@@ -9,7 +9,7 @@ from helpers.views import around, cloud_of, eval_views, write_views
 from gamba_warp.eval.averages import bootstrap, median_of, minus, summary_of
 from gamba_warp.eval.views.compare import NEARLY_EMPTY, GroundTruth, summary
 from gamba_warp.eval.views.evaluate import count_nearly_empty
-from gamba_warp.eval.views.table import differences_of, page, table_of, without_nearly_empty
+from gamba_warp.eval.views.table import differences_of, means, page, table_of, without_nearly_empty
 from gamba_warp.formats.ply import save_ply
 from gamba_warp.image_metrics import on_grounds
 
@@ -82,6 +82,29 @@ def test_tables():
     assert text.count("| novel | model | ") == 2 + 1 + 1  # means, medians, and means without
     blank = page(report | {"nearly_empty": counts | {"views": 0}})
     assert "None of the 4 views" in blank and blank.count("| novel | model | ") == 3
+
+
+def test_objects_are_paired_by_name_and_without_novel_views_left_out():
+    def of(*pairs):
+        return records(*((uid, [values(p) for p in psnrs], [0.3] * 2) for uid, *psnrs in pairs))
+
+    model = of(("a", 21.0, 20.0), ("b", 25.0, 24.0), ("c", 32.0))
+    other = of(("b", 22.0, 21.0), ("a", 20.0, 19.0))
+    rows = table_of({"model": model, "other": other})
+    assert [(r["views"], r["name"], r["objects"]) for r in rows] == [
+        ("novel", "model", 2),
+        ("novel", "other", 2),
+        ("input", "model", 3),
+        ("input", "other", 2),
+    ]
+    assert rows[0]["psnr"]["mean"] == 22 and rows[0]["psnr"]["interval"] == [20, 24]
+    difference, _ = differences_of(model, {"other": other})
+    paired = {"mean": 2.0, "interval": [1.0, 3.0]}  # 1 and 3
+    assert difference["psnr"] == paired | {"median": 2.0, "median_interval": [1.0, 3.0]}
+    assert set(difference["lpips"].values()) == {None}
+    text = means([difference], signed=True).splitlines()
+    assert len({len(line) for line in text}) == 1
+    assert "+2.00 [1.00, 3.00]" in text[2] and "absent" in text[2]
 
 
 def test_a_report_has_both(tmp_path, capsys):

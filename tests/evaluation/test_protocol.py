@@ -11,7 +11,7 @@ from gamba_warp.cli import run
 from gamba_warp.errors import UserError
 from gamba_warp.eval import presets
 from gamba_warp.eval import report as reports
-from gamba_warp.eval.report import check_finite, csv_of, flat, make_report, save_report
+from gamba_warp.eval.report import check_finite, failure, flat, make_report, save_report
 from gamba_warp.eval.shapes.protocol import PRESETS, read_protocol
 
 
@@ -106,20 +106,25 @@ def odd():
         {"name": "huge", "status": "ok", "x": 1.7e308, "nest": {"y": 2.0}},
         {"name": "huger", "status": "ok", "x": 1.7e308, "nest": {"y": 2.0}},
         {"name": "not \udcff UTF-8", "status": "failed", "reason": "\udcff"},
+        failure("a", ValueError("first line\nsecond line")),
     ]
     return make_report({"p": math.nan}, objects, {"v": "1"}, more=[math.inf, (1.0,)])
 
 
 def test_what_is_not_finite_is_a_failure_of_its_object_and_nothing_is_lost(tmp_path, odd):
-    assert [o["name"] for o in odd["objects"] if o["status"] == "ok"] == ["good", "huge", "huger"]
+    done = [o["name"] for o in odd["objects"] if o["status"] == "ok"]
+    assert done == ["good", "huge", "huger"] and odd["objects"][0]["name"] == "a"
+    assert (odd["num_ok"], odd["num_failed"]) == (3, 4)
     reasons = {f["name"]: f["reason"] for f in odd["failures"]}
     assert reasons["bad"] == "nest.y is nan" and "inf" in reasons["list"]
+    assert reasons["a"] == "first line"
     assert odd["mean"]["x"] is None and odd["mean"]["nest"]["y"] == 2.0  # the sum is no number
     assert odd["protocol"] == {"p": None} and odd["more"] == [None, [1.0]]
     save_report(odd, tmp_path)
     assert json.loads((tmp_path / "report.json").read_text()) == json.loads(json.dumps(odd))
     rows = (tmp_path / "objects.csv").read_text().splitlines()
-    assert rows[0].startswith("name,status") and len(rows) == len(csv_of(odd).splitlines()) == 7
+    assert rows[:2] == ["name,status,reason,x,nest.y", "a,failed,first line,,"] and len(rows) == 8
+    assert "good,ok,,1.0,2.0" in rows
     refused(r"^a.b is inf", check_finite, {"a": {"b": [1.0, math.inf]}})
 
 

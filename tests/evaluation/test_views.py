@@ -124,7 +124,7 @@ def test_baselines_have_known_values(data, painted):
 
 def test_failures_are_listed(data, painted, monkeypatch):
     (data / "pred" / "a.ply").unlink()
-    (data / "data" / "group" / "b" / "2.png").write_bytes(b"")
+    (data / "data" / "group" / "b" / "002.png").write_bytes(b"")
 
     def nan_where_c(gaussians, views):
         rgb, alpha = paint(gaussians, views)

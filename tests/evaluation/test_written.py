@@ -55,7 +55,7 @@ def test_the_figures_are_those_of_the_file_that_reconstruct_writes(tmp_path, det
     options = ["--no-baselines", "--strips", 0, "--sheet", 0]
     _, report = eval_views(model, data, tmp_path / "own", *options, *words)
     out = tmp_path / "written"
-    places = [data / "a" / "0.png", "--out", out, "--checkpoint", model, "--no-recenter"]
+    places = [data / "a" / "000.png", "--out", out, "--checkpoint", model, "--no-recenter"]
     words += ["--min-opacity", "0", "--turntable", "none", "--no-page"]
     assert run_reconstruct(*places, *words) == 0
     (written,) = out.glob("*.ply")

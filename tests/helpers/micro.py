@@ -9,17 +9,16 @@ from safetensors.torch import load_file
 
 from gamba_warp.cameras import Cameras, intrinsics, orbit
 from gamba_warp.gaussians import Gaussians
-from gamba_warp.images import save_image
-from gamba_warp.render import render
 from gamba_warp.train import checkpoint
 from gamba_warp.train.batches import Batch, Batches
 from gamba_warp.train.config import TrainConfig
 from gamba_warp.train.ddp import World
 from gamba_warp.train.loop import train
 
+from .views import around, straight, write_views
+
 checkpoint.KEPT = 9  # tests compare the checkpoints of all steps of short runs
 ALONE = World(0, 1, torch.device("cpu"))
-_FLIP = torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0], dtype=torch.float64))
 SIZE = 16
 VIEWS = 6
 # One narrow block and 64 Gaussians.
@@ -27,11 +26,6 @@ MODEL = (
     f"image_size={SIZE}",
     *"patch_size=4 width=16 depth=1 state_size=4 scale_init=0.06".split(),
 )
-
-
-def to_opengl(viewmats: torch.Tensor) -> torch.Tensor:
-    """Convert world-to-camera OpenCV matrices to camera-to-world OpenGL ones, ``[.., 4, 4]``."""
-    return torch.linalg.inv(_FLIP @ viewmats.double()).to(viewmats.dtype)
 
 
 def cloud(seed: int, num: int = 40) -> Gaussians:
@@ -56,28 +50,10 @@ def views_around(count: int, width: int = 32, height: int = 32) -> Cameras:
     return Cameras(viewmats, intrinsics(width, height).expand(count, 3, 3), width, height)
 
 
-def photograph(gaussians: Gaussians, cameras: Cameras) -> torch.Tensor:
-    """Render straight RGBA, as in files."""
-    image = render(gaussians, cameras)
-    return torch.cat([image.rgb / image.alpha.clamp_min(1e-3), image.alpha], -1).clamp(0, 1)
-
-
 def write_object(folder: Path, gaussians: Gaussians, views: int = VIEWS) -> None:
     """Write one object in the transforms.json layout."""
-    azimuths = torch.arange(views) * (360.0 / views)
-    viewmats = orbit(azimuths, elevation=15.0, distance=1.8)
-    cameras = Cameras(viewmats, intrinsics(SIZE, SIZE).expand(views, 3, 3), SIZE, SIZE)
-    rgba = photograph(gaussians, cameras)
-    folder.mkdir(parents=True)
-    K = cameras.Ks[0]
-    frames = []
-    for v in range(views):
-        save_image(folder / f"{v:03d}.png", rgba[v].numpy())
-        pose = to_opengl(viewmats[v]).tolist()
-        frames.append({"file_path": f"{v:03d}.png", "transform_matrix": pose})
-    sizes = {"w": SIZE, "h": SIZE, "cx": SIZE / 2, "cy": SIZE / 2}
-    focal = {"fl_x": K[0, 0].item(), "fl_y": K[1, 1].item()}
-    (folder / "transforms.json").write_text(json.dumps({**sizes, **focal, "frames": frames}))
+    cameras = around(torch.arange(views) * (360.0 / views), 15.0, 1.8, SIZE)
+    write_views(folder, straight(gaussians, cameras).clamp(0, 1), cameras)
 
 
 def write_dataset(root: Path, objects: int = 3) -> Path:

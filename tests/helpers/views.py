@@ -12,7 +12,12 @@ from gamba_warp.gaussians import Gaussians
 from gamba_warp.images import save_image
 from gamba_warp.render import render
 
-from .micro import to_opengl
+_FLIP = torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0], dtype=torch.float64))
+
+
+def to_opengl(viewmats: Tensor) -> Tensor:
+    """Convert world-to-camera OpenCV matrices to camera-to-world OpenGL ones, ``[.., 4, 4]``."""
+    return torch.linalg.inv(_FLIP @ viewmats.double()).to(viewmats.dtype)
 
 
 def around(azimuths, elevation=0.0, distance=1.5, size=32, fov=49.1) -> Cameras:
@@ -51,9 +56,9 @@ def transforms(names, cameras: Cameras) -> str:
 
 
 def write_views(folder: Path, rgba: Tensor, cameras: Cameras) -> None:
-    """Write an object: images ``0.png`` and so on, and their cameras."""
+    """Write an object: images ``000.png`` and so on, and their cameras."""
     folder.mkdir(parents=True)
-    names = [f"{v}.png" for v in range(len(rgba))]
+    names = [f"{v:03d}.png" for v in range(len(rgba))]
     for name, image in zip(names, rgba):
         save_image(folder / name, image.numpy())
     (folder / "transforms.json").write_text(transforms(names, cameras))

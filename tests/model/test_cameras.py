@@ -6,8 +6,9 @@ from dataclasses import replace
 import pytest
 import torch
 from helpers.gaussians import some
-from helpers.micro import to_opengl, write_dataset
+from helpers.micro import write_dataset
 from helpers.model import SMALLEST
+from helpers.views import to_opengl
 from torch.testing import assert_close
 
 from gamba_warp import cameras as C

@@ -5,7 +5,7 @@ import json
 import pytest
 import torch
 from helpers import micro, on_threads
-from helpers.micro import lines, run
+from helpers.micro import lines, run, same_weights
 from helpers.nodes.processes import train_all, words
 from helpers.refusals import refused
 from safetensors.torch import load_file
@@ -35,25 +35,24 @@ def runs(data, tmp_path_factory):
         halves = {**VIEWS, "batch_size": 2, "accumulate": 2}
         assert run(data, folder / "halves", views=halves, **alone) == 0
     ends = train_all([words(data, folder / name, *OPTIONS) for name in ("two", "not-there")])
-    assert [end.code for end in ends] == [0, 0], ends
+    assert [end.returncode for end in ends] == [0, 0], ends
     assert not (folder / "not-there").exists()  # only the first process writes
-    assert ends[1].out == ""
+    assert ends[1].stdout == ""
     # Warp itself reports in every process that no driver was found.
-    assert all(line.startswith("Warp CUDA warning") for line in ends[1].err.splitlines())
+    assert all(line.startswith("Warp CUDA warning") for line in ends[1].stderr.splitlines())
     return folder
 
 
 def weights(run, step, kind="model"):
-    return load_file(run / "checkpoints" / f"step_{step:06d}" / f"{kind}.safetensors")
+    return run / "checkpoints" / f"step_{step:06d}" / f"{kind}.safetensors"
 
 
 def test_two_processes_have_the_bits_of_two_halves_in_turn(runs):
     """Halving a sum is exact, and the sum of two numbers has no order."""
     for kind in ("model", "ema"):
         for step in range(1, STEPS + 1):
-            alone, both = weights(runs / "halves", step, kind), weights(runs / "two", step, kind)
-            for name, value in alone.items():
-                assert torch.equal(value, both[name]), (step, name)
+            files = [weights(runs / name, step, kind) for name in ("halves", "two")]
+            assert same_weights(*files), (step, kind)
     alone, both = (lines(runs / name, "train") for name in ("halves", "two"))
     for a, b in zip(alone, both, strict=True):
         assert b["loss"] == pytest.approx(a["loss"], rel=1e-5)  # of the log's six digits
@@ -66,7 +65,7 @@ def test_two_processes_with_half_the_batch_are_one_to_rounding(runs):
         for name in ("loss", "loss_rgb", "loss_mask", "psnr", "spread", "mean_alpha", "grad_norm"):
             assert b[name] == pytest.approx(a[name], rel=1e-5), name  # of the log's six digits
     for step in range(1, STEPS + 1):
-        one, two = weights(runs / "whole", step), weights(runs / "two", step)
+        one, two = (load_file(weights(runs / name, step)) for name in ("whole", "two"))
         for name, value in one.items():
             # Sums of gradients in another order differ by 1e-7 of their largest parts. Adam divides
             # each by its own size: an entry a thousandth of those moves by 1e-3 * 1e-4 a step more
@@ -84,11 +83,9 @@ def test_two_processes_become_one_and_one_becomes_two(data, runs, tmp_path):
         assert run(data, tmp_path / "one", run=resumed, **options) == 0
     resume = ["--resume", runs / "halves" / step]
     two = [words(data, tmp_path / name, *OPTIONS, *resume) for name in ("two", "not-there")]
-    assert [end.code for end in train_all(two)] == [0, 0]
-    want = weights(runs / "halves", STEPS)
+    assert [end.returncode for end in train_all(two)] == [0, 0]
     for name in ("one", "two"):
-        got = weights(tmp_path / name, STEPS)
-        assert all(torch.equal(got[key], value) for key, value in want.items()), name
+        assert same_weights(weights(tmp_path / name, STEPS), weights(runs / "halves", STEPS)), name
     refused(
         r"objects a step \(4 there, 2 here: --batch-size 4 keeps it\)",
         *(run, data, tmp_path / "other"),

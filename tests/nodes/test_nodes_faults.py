@@ -5,12 +5,10 @@ import re
 import shutil
 
 import pytest
-import torch
 from helpers import micro
 from helpers.forked import python
-from helpers.micro import lines
+from helpers.micro import lines, same_weights
 from helpers.nodes.processes import run_all, train_all, words
-from safetensors.torch import load_file
 
 from gamba_warp import versions
 from gamba_warp.files import PART
@@ -18,7 +16,7 @@ from gamba_warp.train.checkpoint import damage, list_checkpoints
 
 FULL = 20_000  # bytes: enough for the log, not for a checkpoint
 FIVE = ("--views-per-object", 5)  # all of them, at every step
-pytestmark = pytest.mark.slow  # a process takes seconds to import torch
+pytestmark = pytest.mark.slow  # a process takes seconds to
 
 
 @pytest.fixture(scope="module")
@@ -62,14 +60,9 @@ def ends(data, tmp_path_factory):
     (root / "plan.json").write_text(json.dumps(plan))
     command = [python(), "-m", "helpers.nodes.worker", root / "plan.json", root / "end"]
     done = run_all([[*map(str, command)]] * 2)
-    assert [end.code for end in done] == [0, 0], done
+    assert [end.returncode for end in done] == [0, 0], done
     found = [json.loads((root / f"end{rank}").read_text()) for rank in (0, 1)]
     return root, {name: [own[name] for own in found] for name in found[0]}
-
-
-def same_end(a, b):
-    a, b = (load_file(run / "model.safetensors") for run in (a, b))
-    return a.keys() == b.keys() and all(torch.equal(a[name], b[name]) for name in a)
 
 
 def test_a_folder_that_one_process_lacks_ends_all(ends):
@@ -90,13 +83,13 @@ def test_a_full_disk_in_the_middle_of_a_checkpoint_ends_all(ends):
     assert damage(kept) is None and kept.name == "step_000003"
     assert not [path for path in (root / "left").rglob(f"{PART}*")]
     assert found["goes on"] == [[0, ""], [0, ""]]
-    assert same_end(root / "run", root / "undisturbed")
+    assert same_weights(root / "run/model.safetensors", root / "undisturbed/model.safetensors")
 
 
 def test_processes_without_a_common_disk_get_the_checkpoint_sent(ends):
     root, found = ends
     assert found["copied"] == [[0, ""], [0, ""]]
-    assert same_end(root / "far", root / "undisturbed")
+    assert same_weights(root / "far/model.safetensors", root / "undisturbed/model.safetensors")
     assert lines(root / "far", "start")[-1]["resumed_from"].endswith("far/checkpoints/step_000003")
     assert not (root / "elsewhere").exists()
 
@@ -128,9 +121,9 @@ def test_processes_that_differ_are_refused_with_the_difference(data, tmp_path):
     )
     arguments = [words(folder, tmp_path / "out", "--steps", 2) for folder in (data, other)]
     ends = train_all([arguments[0], [*arguments[1], "--lr", "0.01"]], {1: patch})
-    assert [end.code for end in ends] == [2, 2] and not (tmp_path / "out").exists()
-    assert ends[0].err == ends[1].err and ends[0].err.count("\n") == 1, ends
-    line = ends[0].err
+    assert [end.returncode for end in ends] == [2, 2] and not (tmp_path / "out").exists()
+    assert ends[0].stderr == ends[1].stderr and ends[0].stderr.count("\n") == 1, ends
+    line = ends[0].stderr
     for part in (
         "gamba: process 1 on",
         "options: optim.lr is 0.01, not 0.001;",

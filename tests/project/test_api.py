@@ -2,12 +2,12 @@
 
 import ast
 import re
-import subprocess
 import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
+from helpers.children import ran
 from helpers.forked import python
 
 import gamba_warp
@@ -24,7 +24,7 @@ BESIDE = ("gamba_warp.render", "gamba_warp.kernels.selective_scan.reference",
 
 def run(code: str, program: str = sys.executable) -> str:
     """Return the output of a fresh Python."""
-    done = subprocess.run([program, "-c", code], capture_output=True, text=True, cwd=ROOT)
+    done = ran(program, "-c", code, cwd=ROOT)
     assert done.returncode == 0, done.stderr
     return done.stdout
 

@@ -10,6 +10,7 @@ import sys
 from pathlib import Path
 
 import pytest
+from helpers.children import ran
 
 ROOT = Path(__file__).resolve().parents[2]
 TEXT = (ROOT / "Dockerfile").read_text(encoding="utf-8").replace("\\\n", " ")
@@ -66,18 +67,14 @@ def test_the_steps_make_a_program_that_reconstructs(tmp_path):
     here = Path(pytest.__file__).parents[1]
     (site / "here.pth").write_text(f"{here}\n")
     out = tmp_path / "out"
-    command = [place / "bin" / "gamba", "reconstruct", IMAGE, *SMALL, out]
-    alone = {
-        "cwd": tmp_path,
-        "text": True,
-        "env": {name: value for name, value in os.environ.items() if name != "PYTHONPATH"},
-    }
-    done = subprocess.run(command, capture_output=True, timeout=300, **alone)
+    alone = {name: value for name, value in os.environ.items() if name != "PYTHONPATH"}
+    words = ("reconstruct", IMAGE, *SMALL, out)
+    done = ran(place / "bin" / "gamba", *words, cwd=tmp_path, env=alone)
     assert done.returncode == 0, done.stderr
     assert (out / "scopia-toaster.ply").exists()
     code = "import gamba_warp; print(gamba_warp.__file__)"
-    where = [place / "bin" / "python", "-c", code]
-    assert subprocess.check_output(where, **alone).startswith(str(place))
+    where = ran(place / "bin" / "python", "-c", code, cwd=tmp_path, env=alone)
+    assert where.stdout.startswith(str(place))
 
 
 @pytest.mark.slow

@@ -24,14 +24,14 @@ ALL_OF_IT = {
     ROOT / "gamba_warp" / "compat" / "gsplat" / "strategy.py",
     ROOT / "gamba_warp" / "photo" / "plain.py",
     ROOT / "kernels" / "stress" / "run.py",
-    *(ROOT / "gamba_warp" / "app" / f"{name}.py" for name in ("actions", "interface", "look")),
+    *(ROOT / "gamba_warp" / "app" / f"{name}.py" for name in ("actions", "interface")),
 }
 # The name on the command line of an installer, or as an address there.
 BY_NAME = re.compile(
     r"(install|run|add)\s([^\n]*?['\"\s])?gamba[-_]warp[\[=\s'\"]|pypi\.org/\S*gamba"
 )
 # Libraries whose distribution has another name than the module.
-DISTRIBUTIONS = {"PIL": "pillow", "skimage": "scikit-image", "warp": "warp-lang"}
+DISTRIBUTIONS = {"PIL": "pillow", "skimage": "scikit-image", "warp": "warp-lang", "yaml": "pyyaml"}
 # Its weights are taken from the package where somebody has it.
 OPTIONAL = {"lpips"}
 # Refuses each library of the extras as if it were not installed, and runs a command.
@@ -55,6 +55,10 @@ cli.main(sys.argv[1:])
 
 def in_the_core(*arguments):
     return ran(python(), "-c", WITHOUT, *arguments)
+
+
+def distribution(library):
+    return DISTRIBUTIONS.get(library, library.replace("_", "-"))
 
 
 def declared():
@@ -92,11 +96,8 @@ def test_nothing_is_installed_by_a_name_that_is_nobodys():
 
 def test_each_library_is_in_the_extras_that_are_named():
     found = declared()
-    distributions = {"skimage": "scikit-image", "imageio_ffmpeg": "imageio-ffmpeg"}
-    distributions |= {"huggingface_hub": "huggingface-hub", "pillow_heif": "pillow-heif"}
-    distributions |= {"yaml": "pyyaml"}
     for library, extra in versions.EXTRA_OF.items():
-        name = distributions.get(library, library)
+        name = distribution(library)
         holding = {extra} | {e for e, libraries in versions.HOLDS.items() if library in libraries}
         for one in holding:
             assert name in found[one], f"{one} lacks {name}"
@@ -133,12 +134,12 @@ def test_training_loads_without_what_makes_objects(monkeypatch):
     code = WITHOUT.rpartition("cli.main")[0] + "import gamba_warp.train.batches"
     done = ran(python(), "-c", code)
     assert done.returncode == 0, done.stderr
-    from gamba_warp.train.data.pool import Pool, PoolOptions
+    from gamba_warp.train.data.pool import Pool
 
     real = versions.find_spec
     monkeypatch.setattr(versions, "find_spec", lambda n: n != "manifold3d" and real(n) or None)
     with pytest.raises(ModuleNotFoundError) as found:
-        Pool(PoolOptions(0, 0, 1, None), 0)
+        Pool(None, 0)
     assert found.value.name == "manifold3d"
 
 
@@ -206,7 +207,7 @@ def imported() -> dict[str, Path]:
 def test_every_import_is_required():
     required = set().union(*(names for extra, names in declared().items() if extra != "test"))
     libraries = imported()
+    required |= OPTIONAL
     assert {"torch", "scipy", "PIL"} <= set(libraries), "the reader sees imports"
     for name, path in libraries.items():
-        wanted = DISTRIBUTIONS.get(name, name.replace("_", "-"))
-        assert name in OPTIONAL or wanted in required, f"{path}: {name} is not in setup.cfg"
+        assert distribution(name) in required, f"{path}: {name} is not in setup.cfg"

@@ -1,4 +1,4 @@
-"""Validation figures, and the best checkpoint by them."""
+"""Validation figures, from the start on, and the best checkpoint by them."""
 
 import pytest
 import torch
@@ -7,11 +7,6 @@ from helpers.views import eval_views
 
 from gamba_warp.train import validation
 from gamba_warp.train.checkpoint import list_checkpoints
-
-
-@pytest.fixture(scope="module")
-def data(tmp_path_factory):
-    return micro.write_dataset(tmp_path_factory.mktemp("data"), 3)
 
 
 def test_figures_of_a_validation_are_those_of_eval_views(data, tmp_path):
@@ -74,3 +69,32 @@ def test_a_best_that_cannot_be_written_is_said_and_stops_nothing(data, tmp_path)
     assert micro.run(data, tmp_path, run={"val_every": 3}) == 0
     assert "best.safetensors" in micro.lines(tmp_path, "warning")[0]["message"]
     assert not micro.lines(tmp_path, "best")
+
+
+def test_a_fine_tuning_is_validated_before_it_begins(data, tmp_path, capsys):
+    assert micro.run(data, tmp_path / "first", run={"val_every": 3}) == 0
+    assert [line["step"] for line in micro.lines(tmp_path / "first", "val")] == [3, 6]
+    tuned = {"init": tmp_path / "first", "val_every": 3}
+    capsys.readouterr()
+    spoiled = {"optim": {"lr": 3.0, "ema": 0.0}}
+    assert micro.run(data, tmp_path / "second", run=tuned, **spoiled) == 0
+    vals = micro.lines(tmp_path / "second", "val")
+    assert [line["step"] for line in vals] == [0, 3, 6]
+    ends = micro.lines(tmp_path / "first", "val")[-1]
+    assert vals[0]["psnr_novel"] == ends["psnr_novel"]
+    *_, warning = (line["message"] for line in micro.lines(tmp_path / "second", "warning"))
+    assert "the last validation is worse than the first: PSNR" in warning
+    assert "dB at step 0; best.safetensors has" in warning and warning in capsys.readouterr().out
+    assert micro.same_weights(
+        tmp_path / "second" / "best.safetensors", tmp_path / "first" / "model.safetensors"
+    )
+
+
+def test_a_validation_at_the_start_changes_no_bit(data, tmp_path):
+    assert micro.run(data, tmp_path / "first") == 0
+    for name, every in (("with", 100), ("without", 0)):
+        out = tmp_path / name
+        assert micro.run(data, out, run={"init": tmp_path / "first", "val_every": every}) == 0
+    assert micro.same_weights(
+        tmp_path / "with/model.safetensors", tmp_path / "without/model.safetensors"
+    )

@@ -4,17 +4,17 @@ import copy
 import errno
 import math
 import os
-import subprocess
 import zipfile
 from pathlib import Path
 
 import pytest
 import torch
 from helpers import micro
+from helpers.children import ran
 from helpers.forked import python
+from helpers.nodes.processes import environment
 from helpers.refusals import refused
 
-from gamba_warp.errors import UserError
 from gamba_warp.model.checkpoint import load_model
 from gamba_warp.model.gamba import Gamba
 from gamba_warp.train import checkpoint
@@ -75,8 +75,8 @@ def test_full_disk_leaves_the_old_one(tmp_path, model, monkeypatch, error):
         raise error
 
     monkeypatch.setattr(checkpoint.torch, "save", full)
-    with pytest.raises(UserError, match="cannot write .*step_000002"):
-        save_checkpoint(tmp_path, 2, {"model": model}, {"a": 2}, keep=1)
+    said = "cannot write .*step_000002"
+    refused(said, save_checkpoint, tmp_path, 2, {"model": model}, {"a": 2}, keep=1)
     assert names(tmp_path) == ["step_000001"]
     assert read_state(find_checkpoint(tmp_path, "auto")) == {"a": 1}
     assert os.listdir(tmp_path / "checkpoints") == ["step_000001"], "no leftovers"
@@ -96,9 +96,7 @@ def test_killed_while_saving_leaves_the_old_one(tmp_path, model):
         "checkpoint.torch.save = lambda *_: os.kill(os.getpid(), 9)\n"
         "checkpoint.save_checkpoint(run, 2, {'model': model}, {'a': 2}, keep=1)\n"
     )
-    path = os.pathsep.join([str(Path(micro.__file__).parents[1]), os.environ.get("PYTHONPATH", "")])
-    command = [python(), "-c", script, str(tmp_path)]
-    assert subprocess.run(command, env={**os.environ, "PYTHONPATH": path}).returncode == -9
+    assert ran(python(), "-c", script, tmp_path, env=environment()).returncode == -9
     assert names(tmp_path) == ["step_000001"]
     assert len(os.listdir(tmp_path / "checkpoints")) == 2, "the unfinished folder is there"
     assert read_state(find_checkpoint(tmp_path, "auto")) == {"a": 1}
@@ -253,8 +251,8 @@ def test_moments_of_a_state_are_checked(model, change, words):
     optimizer.load_state_dict(checked_moments(optimizer, stored, Path("run/state.pt")))
     assert optimizer.param_groups[0]["betas"] == (0.9, 0.95)
     change(stored)
-    with pytest.raises(UserError, match=f"^run/state.pt: damaged, .*{words}"):
-        checked_moments(optimizer, stored, Path("run/state.pt"))
+    line = f"^run/state.pt: damaged, .*{words}"
+    refused(line, checked_moments, optimizer, stored, Path("run/state.pt"))
 
 
 def repacked(path, change, packing=zipfile.ZIP_STORED):

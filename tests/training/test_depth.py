@@ -10,10 +10,10 @@ import trimesh
 from helpers import micro
 from helpers.meshes import render_views
 from helpers.micro import lines, run
+from helpers.refusals import refused
 
 from gamba_warp.cameras import Cameras, intrinsics, orbit
 from gamba_warp.data.dataset import open_dataset
-from gamba_warp.errors import UserError
 from gamba_warp.gaussians import Gaussians
 from gamba_warp.train.batches import load_sample
 from gamba_warp.train.data.samples import Change
@@ -178,7 +178,6 @@ def test_a_training_brings_the_layers_to_the_surfaces(boxes, tmp_path):
 
 def test_bad_use_is_said_in_one_line(tmp_path):
     clouds = micro.write_dataset(tmp_path / "clouds")
-    with pytest.raises(UserError, match='needs the decoder "rays"'):
-        run(clouds, tmp_path / "out", loss={"lpips": "off", "depth_weight": 1.0})
-    with pytest.raises(UserError, match="has no depth images"):
-        run(clouds, tmp_path / "out", RAYS, loss={"lpips": "off", "depth_weight": 1.0})
+    loss = {"lpips": "off", "depth_weight": 1.0}
+    refused('needs the decoder "rays"', run, clouds, tmp_path / "out", loss=loss)
+    refused("has no depth images", run, clouds, tmp_path / "out", RAYS, loss=loss)

@@ -6,9 +6,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from helpers import micro
+from helpers.refusals import refused
 
 from gamba_warp.data.dataset import open_dataset
-from gamba_warp.errors import UserError
 from gamba_warp.train.batches import Batches, open_data
 from gamba_warp.train.data.poses import front_views
 
@@ -64,8 +64,8 @@ def test_the_objects_of_a_set_named_twice_come_twice_in_an_epoch(roots, tmp_path
 
 def test_two_sets_of_one_name_are_refused(roots, tmp_path):
     other = micro.write_dataset(tmp_path / "other" / "second", 3)
-    with pytest.raises(UserError, match="two objects are called 'second/clouda'"):
-        open_data(micro.options(roots[0], tmp_path, views={"extra": (roots[1], other)}))
+    config = micro.options(roots[0], tmp_path, views={"extra": (roots[1], other)})
+    refused("two objects are called 'second/clouda'", open_data, config)
 
 
 @pytest.mark.parametrize("fraction", [0.0, 1.0])
@@ -86,5 +86,21 @@ def test_inputs_are_from_the_front_as_often_as_told(roots, tmp_path, fraction):
 
 @pytest.mark.parametrize("crop", [8, 17])
 def test_crops_that_lpips_cannot_see_or_no_image_has_are_refused(roots, tmp_path, crop):
-    with pytest.raises(UserError, match=f"--lpips-crop {crop}: must be 0, or 16 to --size 16"):
-        micro.options(roots[0], tmp_path, loss={"lpips_crop": crop})
+    said = f"--lpips-crop {crop}: must be 0, or 16 to --size 16"
+    refused(said, micro.options, roots[0], tmp_path, loss={"lpips_crop": crop})
+
+
+def test_google_scanned_objects_are_refused_wherever_they_come_from(roots, tmp_path):
+    """They are for evaluation. One of the second dataset is for training, one for validation."""
+    first, second = roots
+    for old, new in (("clouda", "Dino_4"), ("cloudc", "Elephant")):
+        (second / old).rename(second / new)
+    micro.write_split(second, train=["Dino_4", "cloudb"], val=["Elephant"])
+    out = tmp_path / "run"
+    for data, views, names in (
+        (second, {}, "Dino_4, Elephant"),
+        (first, {"extra": (second,)}, "second/Dino_4"),
+    ):
+        line = f"the data has Google Scanned Objects.*\\({names}\\): leave them out"
+        refused(line, micro.run, data, out, views=views)
+    assert not out.exists()

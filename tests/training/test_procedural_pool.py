@@ -1,7 +1,6 @@
 """Made objects that other processes render while a model trains: order, reuse, failures."""
 
 import collections
-import dataclasses
 import signal
 
 import numpy as np
@@ -12,13 +11,12 @@ from helpers.refusals import refused
 from gamba_warp.data.dataset import ViewDataset
 from gamba_warp.train.batches import Batches, open_data
 from gamba_warp.train.data import pool as pools
-from gamba_warp.train.data.pool import Pool, PoolOptions
+from gamba_warp.train.data.pool import Pool
 from gamba_warp.train.data.procedural import make_object
 from gamba_warp.train.data.render import draw_views
 from gamba_warp.train.data.settings import Settings
 
 VIEWS = Settings(views=3, size=16, seed=3, depth=True, fronts=1, up="y")
-OPTIONS = PoolOptions(seed=3, rank=0, world=1, views=VIEWS)
 
 
 @pytest.fixture
@@ -35,8 +33,8 @@ def in_process(monkeypatch):
     monkeypatch.setattr(pools, "_make_views", views_of)
 
 
-def views_of(number, seed, settings):
-    return draw_views(make_object(np.random.default_rng([seed, number])), str(number), settings)
+def views_of(number, settings):
+    return draw_views(make_object(np.random.default_rng([3, number])), str(number), settings)
 
 
 @pytest.fixture
@@ -44,8 +42,8 @@ def opened():
     """Pools that end with the test."""
     made = []
 
-    def open_pool(first=0, **changes):
-        made.append(Pool(dataclasses.replace(OPTIONS, **changes), first))
+    def open_pool(first=0, settings=VIEWS):
+        made.append(Pool(settings, first))
         return made[-1]
 
     yield open_pool
@@ -54,8 +52,9 @@ def opened():
 
 
 def test_every_object_is_used_as_often_as_told_in_rounds_that_differ(slots):
-    idle = object.__new__(Pool)
-    idle.options = OPTIONS
+    idle, other = object.__new__(Pool), object.__new__(Pool)
+    vars(idle).update(settings=VIEWS, rank=0, world=1)
+    vars(other).update(settings=VIEWS, rank=1, world=2)
     rounds = [[idle._object(5 * turn + place) for place in range(5)] for turn in range(30)]
     assert all(len({*numbers}) == 5 for numbers in rounds)
     uses = collections.Counter(number for numbers in rounds for number in numbers)
@@ -63,8 +62,6 @@ def test_every_object_is_used_as_often_as_told_in_rounds_that_differ(slots):
     assert {uses[number] for number in middle} == {3}
     news = [len({*after} - {*before}) for before, after in zip(rounds, rounds[1:])]
     assert {1, 2} == {*news}  # 5 slots change within 3 rounds
-    other = object.__new__(Pool)
-    other.options = dataclasses.replace(OPTIONS, rank=1, world=2)
     assert not {other._object(n) for n in range(60)} & {number * 2 for number in uses}
 
 
@@ -82,7 +79,7 @@ def test_a_pool_that_begins_later_goes_on_with_the_same_images(slots, opened, in
 def test_other_processes_make_the_same_images(slots, opened):
     made = opened().take(0)
     number = int(made.uids[0].removeprefix("procedural-3-"))
-    expected = pools._files(views_of(number, 3, VIEWS), made.uids[0])
+    expected = pools._files(views_of(number, VIEWS), made.uids[0])
     ours = ViewDataset({made.uids[0]: lambda uid: expected}, "procedural", cache=False)
     assert_same(made.load(0), ours.load(0))
 
@@ -106,7 +103,7 @@ class Deadly:
 
 def test_a_process_that_dies_is_tried_again_and_then_told(slots, opened, monkeypatch):
     monkeypatch.setattr(pools, "_make_views", Deadly())
-    refused(r"procedural object \d+: its process died of signal 9", opened(views=None).take, 0)
+    refused(r"procedural object \d+: its process died of signal 9", opened().take, 0)
 
 
 @pytest.mark.parametrize("fraction, expected", [(0.5, 4), (0.3, 2), (1.0, 8)])

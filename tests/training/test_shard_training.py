@@ -91,7 +91,7 @@ def test_a_process_without_a_shard_is_one_line(packed, tmp_path, monkeypatch):
 @pytest.mark.slow
 def test_two_processes_train_on_one_set_of_shards(packed, tmp_path):
     ends = train_all([words(packed, tmp_path / "run", "--steps", 4)] * 2)
-    assert [end.code for end in ends] == [0, 0], ends
+    assert [end.returncode for end in ends] == [0, 0], ends
     assert len(lines(tmp_path / "run", "train")) == 4
 
 

@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Iterator
-from dataclasses import dataclass
 from functools import lru_cache, partial
 from itertools import count
 
@@ -33,38 +32,23 @@ USES = 16  # samples of an object
 VIEWS = 12  # of an object
 
 
-@dataclass(frozen=True)
-class PoolOptions:
-    """Options of a pool.
-
-    Attributes:
-        seed: seed of all objects, their cameras and lights.
-        rank: rank of this training process; each has its own objects.
-        world: number of training processes.
-        views: options of the images.
-    """
-
-    seed: int
-    rank: int
-    world: int
-    views: Settings
-
-
 class Pool:
     """Procedural objects by sample number; threads may take them in roughly that order."""
 
-    def __init__(self, options: PoolOptions, first: int) -> None:
+    def __init__(self, settings: Settings, first: int, rank: int = 0, world: int = 1) -> None:
         """Start making the objects of the samples from ``first`` on.
 
         Args:
-            options: the pool's options.
+            settings: of the images; its seed is that of the objects, their cameras and lights.
             first: number of the first sample.
+            rank: rank of this training process; each has its own objects.
+            world: number of training processes.
 
         Raises:
             ModuleNotFoundError: a library for making objects is not installed.
         """
         require(*PROCEDURAL)
-        self.options = options
+        self.settings, self.rank, self.world = settings, rank, world
         self._first = first
         self._ready: dict[int, ViewDataset] = {}
         self._untaken: set[int] = set()  # objects that are ready and were never taken
@@ -89,7 +73,7 @@ class Pool:
                 self._untaken.remove(number)
                 oldest = sample // SLOTS - 1  # other threads may still be in the round before
                 for old in self._ready.keys() - self._untaken:
-                    generation, slot = divmod(old // self.options.world, SLOTS)
+                    generation, slot = divmod(old // self.world, SLOTS)
                     if (generation + 1) * USES - slot % USES - 1 < oldest:  # its last round
                         del self._ready[old]
                 self._changed.notify_all()
@@ -106,16 +90,16 @@ class Pool:
     def _object(self, sample: int) -> int:
         """Number of the object of a sample."""
         round_number, position = divmod(sample, SLOTS)
-        slot = int(_order(self.options.seed, round_number)[position])
+        slot = int(_order(self.settings.seed, round_number)[position])
         generation = (round_number + slot % USES) // USES
-        return (generation * SLOTS + slot) * self.options.world + self.options.rank
+        return (generation * SLOTS + slot) * self.world + self.rank
 
     def _needed(self) -> Iterator[int]:
         """Yield the numbers of all objects, each once, in the order of first use."""
         latest: dict[int, int] = {}
         for sample in count(self._first):
             number = self._object(sample)
-            slot = number // self.options.world % SLOTS
+            slot = number // self.world % SLOTS
             if latest.get(slot) != number:
                 latest[slot] = number
                 yield number
@@ -137,11 +121,11 @@ class Pool:
 
     def _make_one(self, number: int) -> str | None:
         """Make an object in another process; return the reason of a failure."""
-        made = partial(_make_views, seed=self.options.seed, settings=self.options.views)
+        made = partial(_make_views, settings=self.settings)
         _, result = next(iter(run_each(made, [number], workers=1)))
         if isinstance(result, Failed):
             return result.reason
-        uid = f"procedural-{self.options.seed}-{number}"
+        uid = f"procedural-{self.settings.seed}-{number}"
         dataset = ViewDataset({uid: partial(_files, result)}, "procedural", cache=False)
         with self._changed:
             self._ready[number] = dataset
@@ -157,15 +141,15 @@ def _order(seed: int, round_number: int) -> np.ndarray:
     return np.random.default_rng([seed, 5, round_number]).permutation(SLOTS)
 
 
-def _make_views(number: int, seed: int, settings: Settings) -> Views:
+def _make_views(number: int, settings: Settings) -> Views:
     """Make and render an object, in a child process."""
-    from .procedural import (
-        make_object,  # needs libraries that training without procedural objects does not
-    )
+    # It needs libraries that training without procedural objects does not.
+    from .procedural import make_object
 
     quiet_warp()
     torch.set_num_threads(1)
-    return draw_views(make_object(np.random.default_rng([seed, number])), str(number), settings)
+    made = make_object(np.random.default_rng([settings.seed, number]))
+    return draw_views(made, str(number), settings)
 
 
 def _files(views: Views, uid: str) -> ObjectFiles:

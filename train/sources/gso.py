@@ -56,8 +56,8 @@ def find_models(source: Path, names: Sequence[str] = gso.NAMES) -> dict[str, Pat
         raise UserError(f"--source {source}: no such folder")
     found = {}
     for name in names:
-        paths = [folder / f"{name}{end}" for folder in (source, source / "models")
-                 for end in ("", ".zip")]  # fmt: skip
+        ends = [f"{name}{suffix}" for suffix in ("", ".zip")]
+        paths = [folder / end for folder in (source, source / "models") for end in ends]
         path = next((p for p in paths if (p / MESH).is_file() or p.suffix and p.is_file()), None)
         if path is not None:
             found[name] = path

@@ -4,8 +4,8 @@ import os
 import socket
 import subprocess
 import time
-from dataclasses import dataclass
 from pathlib import Path
+from subprocess import CompletedProcess
 from typing import Any
 
 from helpers import micro
@@ -13,15 +13,6 @@ from helpers.forked import python
 
 ROOT = Path(micro.__file__).resolve().parents[2]
 LONGEST = 300  # seconds until processes that wait for one another are killed
-
-
-@dataclass(frozen=True)
-class End:
-    """Result of a process: its exit code and its output."""
-
-    code: int
-    out: str
-    err: str
 
 
 def free_port() -> int:
@@ -47,7 +38,9 @@ def words(data: Path, out: Path, *more: object) -> list[str]:
     return [*map(str, [data, "--set", *micro.MODEL, *kept, *more])]
 
 
-def train_all(arguments: list[list[str]], patch: dict[int, str] | None = None) -> list[End]:
+def train_all(
+    arguments: list[list[str]], patch: dict[int, str] | None = None
+) -> list[CompletedProcess]:
     """Run ``gamba train`` in processes of one group.
 
     Args:
@@ -66,7 +59,7 @@ def train_all(arguments: list[list[str]], patch: dict[int, str] | None = None) -
     return run_all(commands)
 
 
-def run_all(commands: list[list[str]], **more: object) -> list[End]:
+def run_all(commands: list[list[str]], **more: object) -> list[CompletedProcess]:
     """Run commands as one group, like torchrun's workers, with a time limit.
 
     Args:
@@ -90,7 +83,7 @@ def run_all(commands: list[list[str]], **more: object) -> list[End]:
             except subprocess.TimeoutExpired:
                 process.kill()
                 out, err = process.communicate()
-            ends.append(End(process.returncode, out, err))
+            ends.append(CompletedProcess(process.args, process.returncode, out, err))
     finally:
         for process in started:
             if process.poll() is None:
