@@ -91,46 +91,6 @@ def check_lines(path: Path, says: str, wanted: int, there: int) -> None:
         raise UserError(f"{path}: truncated or invalid header, {says} but {there} lines follow")
 
 
-class Lines:
-    """Lines of a text, blank ones too, found without a loop over them.
-
-    Attributes:
-        data: ``[B]`` uint8, the text with a line end behind it.
-        lengths: ``[N]`` int64, bytes of each line with its end.
-        first: ``[N]`` int64, position of each line's first word; undefined for blank lines.
-        sizes: ``[N]`` int64, number of words.
-    """
-
-    def __init__(self, text: bytes) -> None:
-        self.data = np.frombuffer(text if text.endswith(b"\n") else text + b"\n", np.uint8)
-        blank = is_blank(self.data)
-        words = np.flatnonzero(~blank & np.concatenate([[True], blank[:-1]]))
-        ends = np.flatnonzero(self.data == ord("\n"))
-        before = np.searchsorted(words, ends)
-        self.lengths = np.diff(ends, prepend=-1)
-        self.sizes = np.diff(before, prepend=0)
-        self.first = np.append(words, 0)[before - self.sizes]
-
-    def begin_with(self, word: bytes) -> np.ndarray:
-        """Return ``[N]`` bool, True for the lines with this first word; case-sensitive."""
-        found = self.sizes > 0
-        for place, letter in enumerate(word):
-            found &= self.data.take(self.first + place, mode="clip") == letter
-        return found & is_blank(self.data.take(self.first + len(word), mode="clip"))
-
-    def behind(self, word: bytes, lines: np.ndarray) -> bytes:
-        """Return the text of the lines ``[N]`` bool with their first word blanked."""
-        data = self.data.copy()
-        for place in range(len(word)):
-            data[self.first[lines] + place] = ord(" ")
-        return data[np.repeat(lines, self.lengths)].tobytes()
-
-
-def is_blank(letters: np.ndarray) -> np.ndarray:
-    """Return True for ASCII whitespace among ``[N]`` uint8, as C's ``isspace``."""
-    return (letters == ord(" ")) | (letters - np.uint8(ord("\t")) < 5)
-
-
 def blocks_of(text: bytes, source: str) -> Iterator[bytes]:
     """Yield a text in parts of whole lines, which bounds the memory of intermediate results.
 
@@ -202,7 +162,8 @@ class Rows(NamedTuple):
 
 def parse_rows(text: bytes) -> Rows | None:
     """Return the rows of a text, one a line, empty for a blank one; None if a word is no number."""
-    sizes = Lines(text).sizes if text else np.zeros(0, np.int64)
+    lines = text.removesuffix(b"\n").split(b"\n") if text else []
+    sizes = np.array([len(line.split()) for line in lines], np.int64)
     values = parse_numbers(text, int(sizes.sum()))
     return None if values is None else Rows(values, sizes)
 

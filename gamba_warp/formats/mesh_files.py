@@ -11,7 +11,7 @@ from typing import BinaryIO
 import numpy as np
 
 from ..errors import UserError
-from .headers import BOM, Lines, Source, blocks_of, check_lines, compare_sizes, read_rows
+from .headers import BOM, Source, blocks_of, check_lines, compare_sizes, read_rows
 from .materials import Material, SideFiles
 from .parts import Part, cut_polygons, strip_faces, to_rgba8
 from .ply_data import Columns, PlyData, PlyList, spread
@@ -115,17 +115,17 @@ def read_stl(source: Source, sides: SideFiles) -> Iterator[Part]:
 
 def _text_corners(path: Path, data: bytes, sides: SideFiles) -> np.ndarray:
     """Return ``[3 F, 3]``; keywords begin a line, in either case, as a name may be any words."""
-    begun = ends = last = 0
-    rows = []
+    counts, rows = {b"facet": 0, b"endfacet": 0, b"endsolid": 0}, []
     text = data.removeprefix(BOM).replace(b"\r", b"\n").lower()
     for block in blocks_of(text, str(path)):
-        lines = Lines(block)
-        begun, ends, last = (
-            count + np.count_nonzero(lines.begin_with(word))
-            for count, word in ((begun, b"facet"), (ends, b"endfacet"), (last, b"endsolid"))
-        )
-        rows.append(lines.behind(b"vertex", lines.begin_with(b"vertex")))
-    points = read_rows(b"".join(rows), str(path)).table(str(path), (3,))
+        for line in block.split(b"\n"):
+            word, *more = line.split(maxsplit=1) or [b""]
+            if word in counts:
+                counts[word] += 1
+            elif word == b"vertex":
+                rows += more or [b""]
+    points = read_rows(b"\n".join(rows), str(path)).table(str(path), (3,))
+    begun, ends, last = counts.values()
     if not last and len(points):
         sides.omit("there is no endsolid: the end of the file may be missing")
     if not begun == ends == len(points) / 3:

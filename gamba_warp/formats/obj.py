@@ -11,19 +11,7 @@ from PIL import Image
 
 from ..color_spaces import to_linear
 from ..errors import UserError
-from .headers import (
-    BOM,
-    Lines,
-    Rows,
-    Source,
-    blocks_of,
-    is_blank,
-    is_number,
-    joined_rows,
-    parse_numbers,
-    parse_rows,
-    without_comments,
-)
+from .headers import BOM, Rows, Source, blocks_of, is_number, joined_rows, parse_numbers
 from .materials import GREY, Material, SideFiles, plain
 from .parts import Part, color_range, cut_polygons, to_rgba8
 
@@ -133,75 +121,73 @@ class _Statements:
         self._totals = np.zeros(3, np.int64)  # of v, vt and vn in the blocks before
         line = 0
         for block in blocks_of(text, str(path)):
-            lines = Lines(block)
+            lines = block.removesuffix(b"\n").split(b"\n")
             if not self._read(path, lines, line):
-                raise _invalid_line(path, block, line)
-            line += len(lines.sizes)
+                raise _invalid_line(path, lines, line)
+            line += len(lines)
 
-    def _read(self, path: Path, lines: Lines, start: int) -> bool:
+    def _read(self, path: Path, lines: list[bytes], start: int) -> bool:
         """Read a block whose first line has this number; return False if a line is invalid."""
-        others = (lines.sizes > 0) & (lines.data.take(lines.first, mode="clip") != ord("#"))
-        counts = np.zeros((len(lines.sizes), 3), np.int64)
-        for column, (word, least) in enumerate(_LEAST.items()):
-            which = lines.begin_with(word)
-            others &= ~which
-            counts[:, column] = which
-            rows = parse_rows(without_comments(lines.behind(word, which)))
-            if rows is None or (rows.sizes < least).any():
+        words: dict[bytes, list[bytes]] = {word: [] for word in (*_LEAST, b"f")}
+        sizes: dict[bytes, list[int]] = {word: [] for word in words}  # words of each line
+        faces, before = [], []  # lines of faces; numbers of v, vt and vn before each
+        for number, line in enumerate(lines, start):
+            word = next(iter(line.split(maxsplit=1)), b"")
+            if word in words:
+                more = line.partition(b"#")[0].split()[1:]
+                words[word] += more
+                sizes[word].append(len(more))
+                if word == b"f":
+                    faces.append(number)
+                    before.append([len(sizes[other]) for other in _LEAST])
+            elif word in (b"mtllib", b"usemtl"):
+                name = line.strip()[len(word) :].decode("utf-8", "replace").strip()
+                if word == b"mtllib":
+                    self.libraries.append(name)
+                else:
+                    self.used.append((number, self.names.setdefault(name, len(self.names))))
+            elif word.isalpha() and word.islower():
+                self.unread.add(word[:30].decode())
+        for word, least in _LEAST.items():
+            values = parse_numbers(b" ".join(words[word]), len(words[word]))
+            if values is None or min(sizes[word], default=least) < least:
                 return False
-            self.rows[word].append(rows)
-        which = lines.begin_with(b"f")
-        found = _corners(without_comments(lines.behind(b"f", which)))
-        if found is None:
+            self.rows[word].append(Rows(values, np.array(sizes[word], np.int64)))
+        corners, lengths = _corners(words[b"f"]), np.array(sizes[b"f"], np.int64)
+        if corners is None:
             return False
-        corners, lengths = found
         if (corners < 0).any():  # they count back from their own line
-            totals = (self._totals + np.cumsum(counts, axis=0))[which]
+            totals = self._totals + np.array(before)
             corners += np.where(corners < 0, np.repeat(totals, lengths, axis=0) + 1, 0)
             if (corners < [1, 0, 0]).any():
                 raise UserError(f"{path}: a face refers to a vertex before the first")
-        self._totals += counts.sum(0)
+        self._totals += [len(sizes[word]) for word in _LEAST]
         self.corners.append(corners)
         self.lengths.append(lengths)
-        self.faces.append(start + np.flatnonzero(which))
-        for word in (b"f", b"g", b"o", b"s"):  # groups are as frequent as faces in some files
-            others &= ~lines.begin_with(word)
-        texts = lines.behind(b"", others).split(b"\n")
-        for at, line in zip(np.flatnonzero(others).tolist(), texts):
-            word = line.split(maxsplit=1)[0]
-            if word in (b"mtllib", b"usemtl"):
-                name = line.strip()[len(word) :].decode("utf-8", "replace").strip()
-            if word == b"mtllib":
-                self.libraries.append(name)
-            elif word == b"usemtl":
-                self.used.append((start + at, self.names.setdefault(name, len(self.names))))
-            elif word.isalpha() and word.islower():
-                self.unread.add(word[:30].decode())
+        self.faces.append(np.array(faces, np.int64))
         return True
 
 
-def _corners(text: bytes) -> tuple[np.ndarray, np.ndarray] | None:
-    """Read the corners of faces, a face a line: ``7``, ``7/8``, ``7//9`` or ``7/8/9``.
+def _corners(words: list[bytes]) -> np.ndarray | None:
+    """Read the corners of faces: ``7``, ``7/8``, ``7//9`` or ``7/8/9``.
 
     Returns:
-        ``[C, 3]`` int64, the indices as written, 0 where one is missing; and ``[F]`` int64, the
-        number of each face's corners. None if a corner is invalid.
+        ``[C, 3]`` int64, the indices as written, 0 where one is missing; None if one is invalid.
     """
-    lines = Lines(text)
-    letters, sizes = lines.data, lines.sizes if text else np.zeros(0, np.int64)
+    text = b" ".join(words) + b" "
+    letters = np.frombuffer(text, np.uint8)
     slash = letters == ord("/")
     inside = (letters - np.uint8(ord("0")) < 10) | (letters == ord("-"))
-    if not (inside | slash | is_blank(letters)).all() or b"///" in text:
+    if not (inside | slash | (letters == ord(" "))).all() or b"///" in text:
         return None
-    before = np.concatenate([[False], inside[:-1]])
-    starts = np.flatnonzero(inside & ~before)
+    starts = np.flatnonzero(inside & ~np.append(False, inside[:-1]))
     numbers = parse_numbers(text.replace(b"/", b" "), len(starts), np.int64)
     if numbers is None or (np.abs(numbers) >= 10**_DIGITS).any():
         return None
     # Steps from one number to the next: a slash, two, or none before the first of a corner.
     steps = slash[starts - 1].astype(np.int8) + (slash[starts - 1] & slash[starts - 2])
     heads = np.flatnonzero(steps == 0)
-    if len(heads) != sizes.sum():  # a corner begins with a slash
+    if len(heads) != len(words):  # a corner begins with a slash
         return None
     within = np.arange(len(starts)) - np.repeat(heads, np.diff(heads, append=len(starts)))
     places = steps + np.where(within == 2, np.roll(steps, 1), 0)
@@ -209,12 +195,12 @@ def _corners(text: bytes) -> tuple[np.ndarray, np.ndarray] | None:
         return None
     corners = np.zeros((len(heads), 3), np.int64)
     corners[np.cumsum(steps == 0) - 1, places] = numbers
-    return None if (corners[:, 0] == 0).any() else (corners, sizes)
+    return None if (corners[:, 0] == 0).any() else corners
 
 
-def _invalid_line(path: Path, block: bytes, before: int) -> UserError:
+def _invalid_line(path: Path, lines: list[bytes], before: int) -> UserError:
     """Return the error of the first invalid line of a block, ``before`` lines from the start."""
-    for number, line in enumerate(block.split(b"\n"), before + 1):
+    for number, line in enumerate(lines, before + 1):
         words = line.partition(b"#")[0].split() or [b""]
         if words[0] == b"f":
             valid = all(_CORNER.fullmatch(word) for word in words[1:])
