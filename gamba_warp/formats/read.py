@@ -124,7 +124,13 @@ def _read(source: Source, left_out: list[str] | None, only: type | None) -> Shap
     elif suffix in MESH_SUFFIXES:
         kind, build = TexturedMesh, lambda: read_mesh(source, sides)
     else:
-        raise UserError(f"{path}: {_advice(suffix)}")
+        advice = f"not one of {', '.join(SHAPE_SUFFIXES)}"
+        if suffix in IMAGE_SUFFIXES:
+            advice = "an image; gamba reconstruct makes Gaussians of it"
+        elif suffix in _CONVERTED:
+            tool = "SuperSplat (superspl.at/editor) and splat-transform convert it to .ply"
+            advice = f"the format {suffix} is not supported; {tool}"
+        raise UserError(f"{path}: {advice}")
     if only not in (None, kind):
         raise UserError(f"{path}: contains {_WORDS[kind]}, not {_WORDS[only]}")
     shape = build()
@@ -174,16 +180,6 @@ def rotation_between(axes: str, others: str) -> np.ndarray:
     if UNKNOWN in (axes, others):
         return np.eye(3)
     return TO_Z_UP[others].T @ TO_Z_UP[axes]
-
-
-def _advice(suffix: str) -> str:
-    """Return what to do with a file that is no shape."""
-    if suffix in IMAGE_SUFFIXES:
-        return "an image; gamba reconstruct makes Gaussians of it"
-    if suffix in _CONVERTED:
-        tool = "SuperSplat (superspl.at/editor) and splat-transform convert it to .ply"
-        return f"the format {suffix} is not supported; {tool}"
-    return f"not one of {', '.join(SHAPE_SUFFIXES)}"
 
 
 def read_gaussians(path: str | Path, left_out: list[str] | None = None) -> Gaussians:
