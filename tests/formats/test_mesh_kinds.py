@@ -37,8 +37,7 @@ def places(mesh):
 
 
 def areas(points, faces):
-    corners = points[faces]
-    return np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]) / 2
+    return trimesh.triangles.cross(points[faces]) / 2
 
 
 def ply(rows, faces, colours="", face_colours="", head="", kind="uchar"):
