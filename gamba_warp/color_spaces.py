@@ -107,7 +107,11 @@ def conversion(image: Image.Image, warn: Callable[[str], None]) -> Convert | Non
     profile, what = image.info.get("icc_profile"), "space"
     try:
         if (points := _code_points(image)) is not None:
-            return _from_points(*points)
+            primaries, transfer, full = points
+            if primaries not in _PRIMARIES or transfer not in _CURVES or not full:
+                narrow = "" if full else ", narrow range"
+                raise ValueError(f"primaries {primaries}, transfer {transfer} of H.273{narrow}")
+            return _from_space(Space(_PRIMARIES[primaries], _CURVES[transfer]))
         if profile is None:
             return _from_space(_stated_space(image))
         what = "profile"
@@ -148,14 +152,6 @@ def _code_points(image: Image.Image) -> tuple[int, int, bool] | None:
     return found
 
 
-def _from_points(primaries: int, transfer: int, full: bool) -> Convert | None:
-    """Return the conversion from a space of H.273. Raises ValueError if it is not known."""
-    if primaries not in _PRIMARIES or transfer not in _CURVES or not full:
-        narrow = "" if full else ", narrow range"
-        raise ValueError(f"primaries {primaries}, transfer {transfer} of H.273{narrow}")
-    return _from_space(Space(_PRIMARIES[primaries], _CURVES[transfer]))
-
-
 def _stated_space(image: Image.Image) -> Space:
     """Return the space of PNG's cHRM and gAMA or of EXIF; sRGB without any."""
     if "srgb" in image.info:
@@ -189,7 +185,7 @@ def _from_space(space: Space) -> Convert | None:
 
 
 @functools.lru_cache(8)
-def _from_profile(profile: bytes, mode: str) -> Callable[[Image.Image], Image.Image] | None:
+def _from_profile(profile: bytes, mode: str) -> Convert | None:
     """Return the conversion of L, RGB or CMYK pixels from a profile to sRGB; alpha is kept.
 
     None if no value changes by more than 1: then the profile is sRGB up to rounding.
@@ -224,9 +220,7 @@ def _from_profile(profile: bytes, mode: str) -> Callable[[Image.Image], Image.Im
     return _keeping_alpha(colours)
 
 
-def _keeping_alpha(
-    colours: Callable[[Image.Image], Image.Image],
-) -> Callable[[Image.Image], Image.Image]:
+def _keeping_alpha(colours: Convert) -> Convert:
     """Extend a conversion to images with alpha, which is copied."""
 
     def convert(band: Image.Image) -> Image.Image:

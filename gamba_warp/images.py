@@ -18,7 +18,7 @@ from typing import Any, BinaryIO, cast
 import numpy as np
 from PIL import Image, UnidentifiedImageError, features
 
-from .color_spaces import conversion
+from .color_spaces import Convert, conversion
 from .errors import FileWarning, UserError, first_line
 from .files import atomic_path, other_kinds
 from .versions import to_install
@@ -82,7 +82,13 @@ def open_image(
         with _without_warnings():
             image = Image.open(source, formats=tuple(formats))
         with image:
-            _check_raw(image, name)
+            tags: Any = getattr(image, "tag_v2", {})
+            raw = _DNG_VERSION in tags or tags.get(_SUBFILE_TYPE, 0) & 1
+            if image.format == "TIFF" and raw:  # Pillow sees only a preview
+                raise UserError(
+                    f"{name}: a raw photograph, of which only a preview of "
+                    f"{image.width}x{image.height} can be read; export it as JPEG, PNG or TIFF"
+                )
             check_size(image.width, image.height, name, max_pixels)
             yield image
     except UserError:
@@ -94,16 +100,6 @@ def open_image(
     except Exception as error:  # decoders raise errors of nearly any type on damaged files
         reason = first_line(error)
         raise UserError(f"{name}: cannot be decoded ({reason})") from error
-
-
-def _check_raw(image: Image.Image, name: object) -> None:
-    """Refuse a camera's raw file, of which Pillow sees only a preview. Raises UserError."""
-    tags: Any = getattr(image, "tag_v2", {})
-    if image.format == "TIFF" and (_DNG_VERSION in tags or tags.get(_SUBFILE_TYPE, 0) & 1):
-        raise UserError(
-            f"{name}: a raw photograph, of which only a preview of {image.width}x{image.height} "
-            "can be read; export it as JPEG, PNG or TIFF"
-        )
 
 
 def check_size(width: int, height: int, name: object, max_pixels: int = MAX_PIXELS) -> None:
@@ -286,7 +282,9 @@ def to_rgba(
 
 def _with_alpha(image: Image.Image) -> Image.Image:
     """Return the image in a mode of ``_PLAIN``, I or F, with a transparent value made alpha."""
-    key, raw = image.info.get("transparency"), _raw_mode(image)
+    key, tiles = image.info.get("transparency"), getattr(image, "tile", None)
+    raw = tiles[0][3] if tiles else None  # Pillow's mode of the pixels in the file
+    raw = raw if isinstance(raw, str) else ""
     if raw in _LOW_BYTES and image.format == "PNG":
         return _rounded(image, raw, key)
     if key is None or image.mode in ("P", "PA"):
@@ -336,16 +334,7 @@ def _rounded(image: Image.Image, raw: str, key: Sequence[int] | None) -> Image.I
     return image
 
 
-def _raw_mode(image: Image.Image) -> str | None:
-    """Return Pillow's raw mode of the pixels in the file, known before decoding."""
-    tiles = getattr(image, "tile", None)
-    raw = tiles[0][3] if tiles else None
-    return raw if isinstance(raw, str) else None
-
-
-def _pixels(
-    image: Image.Image, dtype: type, convert: Callable[[Image.Image], Image.Image] | None
-) -> np.ndarray:
+def _pixels(image: Image.Image, dtype: type, convert: Convert | None) -> np.ndarray:
     """Return ``[H, W, 4]`` float32 in [0, 1] or uint8, converted in bands to save memory."""
     out = np.empty((image.height, image.width, 4), dtype)
     grey, top = image.mode.startswith(("I", "F")), 65535.0  # PIL reads 16-bit colour as 8-bit

@@ -13,8 +13,7 @@ import numpy as np
 
 from gamba_warp.data.layouts import Placement
 from gamba_warp.errors import UserError
-from gamba_warp.formats.clouds import Cloud
-from gamba_warp.formats.read import TO_Z_UP, read, rotation_between
+from gamba_warp.formats.read import TO_Z_UP, Cloud, read, rotation_between
 from gamba_warp.gaussians import Gaussians
 from gamba_warp.surfaces.extract import extract_surface
 

@@ -136,7 +136,7 @@ def cut_by_network(cut: Cut, options: CutoutOptions) -> Cut:
     try:
         if models.cached() is None:
             models.fetch(best, best.address)
-    except models.NotFetched as error:
+    except UserError as error:
         raise UserError(f"the network cannot be fetched: {error}") from None
     again = cut_image(cut.path, cut.name, options)
     if again.found is None:

@@ -48,9 +48,8 @@ def view_command(
 
     import numpy as np
 
-    from ..formats.clouds import Cloud
     from ..formats.meshes import TexturedMesh
-    from ..formats.read import read
+    from ..formats.read import Cloud, read
     from ..gaussians import Gaussians
     from ..trajectories.paths import Viewpoint
     from ..viewer.pack import own_frame, viewed_mesh, visible

@@ -72,28 +72,6 @@ def one_of(name: str, value: Any, *allowed: Any) -> None:
         raise ValueError(f"{name} {verdict} {', '.join(map(repr, allowed))}, got {got}")
 
 
-def positive(**numbers: float) -> None:
-    """Refuse numbers that are not above 0, by name.
-
-    Raises:
-        ValueError: one is not.
-    """
-    for name, value in numbers.items():
-        if not value > 0:
-            raise ValueError(f"{name} must be > 0, got {value}")
-
-
-def at_least_0(**numbers: float) -> None:
-    """Refuse numbers that are below 0, by name.
-
-    Raises:
-        ValueError: one is.
-    """
-    for name, value in numbers.items():
-        if not value >= 0:
-            raise ValueError(f"{name} must be >= 0, got {value}")
-
-
 def side(**pixels: Any) -> list[int]:
     """Return sizes of images or tiles as ints, given as any integers from 1 to 32,768.
 

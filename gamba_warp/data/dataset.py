@@ -33,6 +33,8 @@ from ..untrusted.documents import read_document
 from .layouts import (
     GOBJAVERSE,
     LAYOUTS,
+    NERF,
+    TRANSFORMS,
     MemoryImage,
     ObjectFiles,
     find_objects,
@@ -233,8 +235,8 @@ def index_dataset(folder: str | Path) -> tuple[Path, int, dict[str, str]]:
 
 # In an object's folder: files and folders whose size and time a manifest compares.
 _CAMERA_FILES = {
-    "transforms": ("transforms.json",),
-    "nerf": ("transforms_train.json", "transforms_val.json", "transforms_test.json"),
+    "transforms": TRANSFORMS,
+    "nerf": NERF,
     "gobjaverse": (GOBJAVERSE,),
     "openlrm": ("intrinsics.npy", "rgba", "pose"),
 }

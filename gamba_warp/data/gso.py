@@ -33,50 +33,14 @@ AZIMUTHS = tuple(45.0 * number for number in range(8))  # degrees; at 0 the came
 VIEWS = len(ELEVATIONS) * len(AZIMUTHS)
 UP: Literal["z"] = "z"  # of the set's files
 
-GROUPS: dict[str, tuple[str, ...]] = {
-    group: tuple(names.split())
-    for group, names in {
-        "animals and figures": """
-            Android_Figure_Orange Breyer_Horse_Of_The_Year_2015 Great_Dinos_Triceratops_Toy Racoon
-            Schleich_African_Black_Rhino Schleich_Lion_Action_Figure
-            Schleich_Spinosaurus_Action_Figure Sootheze_Cold_Therapy_Elephant Squirrel
-            Weisshai_Great_White_Shark
-        """,
-        "toys": """
-            3D_Dollhouse_Sofa BALANCING_CACTUS BUNNY_RACER CASTLE_BLOCKS CHICKEN_NESTING
-            SHAPE_SORTER SORTING_BUS STACKING_BEAR Sonny_School_Bus Vtech_Roll_Learn_Turtle
-        """,
-        "shoes, bags and hats": """
-            11pro_SL_TRX_FG AMBERLIGHT_UP_W ASICS_GELAce_Pro_Pearl_WhitePink
-            Azure_Snake_Tieks_Leather_Snake_Print_Ballet_Flats Big_Dot_Pink_Pencil_Case
-            DPC_Handmade_Hat_Brown Jansport_School_Backpack_Blue_Streak
-            Olive_Kids_Paisley_Pencil_Case REEF_BANTU Reef_Star_Cushion_Flipflops_Size_8_Black
-        """,
-        "kitchen and table": """
-            ACE_Coffee_Mug_Kristen_16_oz_cup BIA_Cordon_Bleu_White_Porcelain_Utensil_Holder_900028
-            Black_Decker_Stainless_Steel_Toaster_4_Slice Chefmate_8_Frypan
-            Cole_Hardware_Bowl_Scirocco_YellowBlue
-            JA_Henckels_International_Premio_Cutlery_Block_Set_14Piece
-            Nordic_Ware_Original_Bundt_Pan Room_Essentials_Mug_White_Yellow
-            Threshold_Porcelain_Teapot_White TriStar_Products_PPC_Power_Pressure_Cooker_XL_in_Black
-        """,
-        "house and tools": """
-            Asus_80211ac_DualBand_Gigabit_Wireless_Router_RTAC68R BlueBlack_Nintendo_3DSXL
-            Cole_Hardware_Hammer_Black Ecoforms_Plant_Container_GP16A_Coral HeavyDuty_Flashlight
-            Hefty_Waste_Basket_Decorative_Bronze_85_liter
-            Logitech_Ultimate_Ears_Boom_Wireless_Speaker_Night_Black Poppin_File_Sorter_Blue
-            Razer_Naga_MMO_Gaming_Mouse Remington_TStudio_Hair_Dryer
-        """,
-        "packages and bottles": """
-            5_HTP Animal_Crossing_New_Leaf_Nintendo_3DS_Game Balderdash_Game
-            Black_Forest_Fruit_Snacks_28_Pack_Grape Crayola_Crayons_24_count
-            Nescafe_16Count_Dolce_Gusto_Cappuccino_Capsules
-            Pepsi_Max_Cola_Zero_Calorie_12_12_fl_oz_355_ml_cans_144_fl_oz_426_lt Perricone_MD_OVM
-            Twinlab_Nitric_Fuel Whey_Protein_Vanilla
-        """,
-    }.items()
-}
-NAMES = tuple(sorted(name for group in GROUPS.values() for name in group))
+
+def _listed(name: str) -> frozenset[str]:
+    """Return the names in a text file of this package, one a line, without its comments."""
+    text = (files(__package__ or "gamba_warp.data") / name).read_text(encoding="utf-8")
+    return frozenset(line for line in text.split("\n") if line and not line.startswith("#"))
+
+
+NAMES = tuple(sorted(_listed("gso_evaluated.txt")))
 
 
 @cache
@@ -86,8 +50,7 @@ def all_names() -> frozenset[str]:
     Source: the table of names in MOVi (Kubric, ``challenges/movi/movi_e.py``), which includes all
     names of the evaluation.
     """
-    text = (files(__package__ or "gamba_warp.data") / "gso_names.txt").read_text(encoding="utf-8")
-    return frozenset(text.split())
+    return _listed("gso_names.txt")
 
 
 def scanned(uids: Iterable[str]) -> list[str]:

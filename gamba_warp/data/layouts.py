@@ -39,6 +39,8 @@ from ..untrusted.arrays import read_array
 from ..untrusted.documents import read_document
 from ..untrusted.names import Within, inside
 
+TRANSFORMS = ("transforms.json",)
+NERF = ("transforms_train.json", "transforms_val.json", "transforms_test.json")
 GOBJAVERSE = "campos_512_v4"
 GOBJAVERSE_FOCAL = 1422.222 / 1024  # in heights of the image, if the JSON states no x_fov
 MAX_VIEWS = 10_000  # of an object
@@ -411,20 +413,12 @@ def _with_suffix(image: Path | MemoryImage) -> Path | MemoryImage:
     return next((p for p in found if p.exists()), found[1])
 
 
-def _read_transforms(folder: Path) -> ObjectFiles:
-    return _read_frames([folder / "transforms.json"])
-
-
-def _read_nerf(folder: Path) -> ObjectFiles:
-    paths = [folder / f"transforms_{part}.json" for part in ("train", "val", "test")]
-    return _read_frames([path for path in paths if os.path.lexists(path)])
-
-
-def _read_frames(paths: list[Path]) -> ObjectFiles:
-    """Read one object from the frames of all files."""
-    return object_of(
-        [(path, read_document(path, object), Within(path.parent).path) for path in paths]
-    )
+def _read_frames(names: tuple[str, ...], folder: Path) -> ObjectFiles:
+    """Read one object from the frames of the first of these files, and of others that exist."""
+    paths = [folder / name for name in names]
+    paths = paths[:1] + [path for path in paths[1:] if os.path.lexists(path)]
+    documents = [(path, read_document(path, object), Within(folder).path) for path in paths]
+    return object_of(documents)
 
 
 def object_of(documents: Sequence[tuple[Path | str, object, Find]]) -> ObjectFiles:
@@ -562,8 +556,8 @@ def _read_openlrm(folder: Path) -> ObjectFiles:
 # By name: the file or folder that marks an object's folder, and the folder's reader, which raises
 # UserError. A script may add to it (docs/train-your-own.md).
 LAYOUTS: dict[str, tuple[str, Callable[[Path], ObjectFiles]]] = {
-    "transforms": ("transforms.json", _read_transforms),
-    "nerf": ("transforms_train.json", _read_nerf),
+    "transforms": (TRANSFORMS[0], partial(_read_frames, TRANSFORMS)),
+    "nerf": (NERF[0], partial(_read_frames, NERF)),
     "gobjaverse": (GOBJAVERSE, _read_gobjaverse),
     "openlrm": ("intrinsics.npy", _read_openlrm),
 }

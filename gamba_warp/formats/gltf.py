@@ -225,11 +225,15 @@ class _Reader:
         size = sum(min(x.nbytes, _GLOSSY) for _, x in images if x is not None)
         if not self.sides.claim(6 * size, "glossy images"):
             images = [(name, None) for name in names]
+        small = {name: x if x is None else Image.fromarray(x) for name, x in images}
+        for name, image in small.items():
+            while image is not None and 4 * image.width * image.height > _GLOSSY:
+                small[name] = image = image.reduce(2)
         found = specular_to_pbr(
             diffuseFactor=gloss.vector("diffuseFactor", _WHITE),
             specularFactor=gloss.vector("specularFactor", _WHITE[:3]),
             glossinessFactor=gloss.get("glossinessFactor", float, 1.0),
-            **{name: x if x is None else _smaller(x) for name, x in images},
+            **small,
         )
         texture = found.get("baseColorTexture")
         texture = None if texture is None else np.array(texture.convert("RGBA"))
@@ -296,14 +300,6 @@ class _Reader:
                 sums += weight
             number += 1
         return np.where(sums == 0, joints[0], total / np.where(sums == 0, 1, sums))
-
-
-def _smaller(texture: np.ndarray) -> Image.Image:
-    """Return an image of at most ``_GLOSSY`` bytes."""
-    image = Image.fromarray(texture)
-    while 4 * image.width * image.height > _GLOSSY:
-        image = image.reduce(2)
-    return image
 
 
 def _faces(path: Path, indices: np.ndarray, mode: int) -> np.ndarray:

@@ -129,12 +129,12 @@ class GltfFile:
         buffer, length = view.need("buffer", Index), view.need("byteLength", Index)
         start = view.get("byteOffset", Index, 0)
         if buffer not in self._buffers:
-            self._buffers[buffer] = self._buffer_bytes(buffer)
+            self._buffers[buffer] = self._buffer(buffer)
         data = memoryview(self._buffers[buffer])[start:]
         compare_sizes(self.path, f"the bytes of view {index}", length, len(data), exact=False)
         return data[:length]
 
-    def _buffer_bytes(self, index: int) -> bytes:
+    def _buffer(self, index: int) -> bytes:
         buffer, data = self.item("buffers", index), self.binary
         uri, length = buffer.get("uri", str), buffer.need("byteLength", Index)
         if uri is not None:
@@ -157,11 +157,8 @@ class GltfFile:
 
     def values(self, index: int) -> np.ndarray:
         """Return the numbers of an accessor, ``[N, C]``, as stored; float64 if normalised."""
-        if index not in self._values:
-            self._values[index] = self._read_values(index)
-        return self._values[index]
-
-    def _read_values(self, index: int) -> np.ndarray:
+        if index in self._values:
+            return self._values[index]
         accessor = self.item("accessors", index)
         kind, says = np.dtype(_KINDS[accessor.need("componentType", _Kind)]), f"accessor {index}"
         shape = accessor.need("count", Index), _WIDTHS[accessor.need("type", _Width)]
@@ -181,7 +178,8 @@ class GltfFile:
                 raise UserError(f"{self.path}: {says} changes value {found.max()} of {shape[0]}")
             rows = rows.copy()
             rows[found] = self._rows(sparse.entry("values"), kind, (count, shape[1]), says)
-        return normalised(rows) if accessor.get("normalized", bool) else rows
+        self._values[index] = normalised(rows) if accessor.get("normalized", bool) else rows
+        return self._values[index]
 
     def _rows(self, source: Entry, kind: Any, shape: tuple[int, int], says: str) -> np.ndarray:
         index, start = source.need("bufferView", Index), source.get("byteOffset", Index, 0)

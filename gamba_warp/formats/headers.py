@@ -7,7 +7,7 @@ import re
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, BinaryIO, NamedTuple
+from typing import BinaryIO, NamedTuple
 
 import numpy as np
 
@@ -91,46 +91,6 @@ def check_lines(path: Path, says: str, wanted: int, there: int) -> None:
         raise UserError(f"{path}: truncated or invalid header, {says} but {there} lines follow")
 
 
-class Lines:
-    """Lines of a text, blank ones too, found without a loop over them.
-
-    Attributes:
-        data: ``[B]`` uint8, the text with a line end behind it.
-        lengths: ``[N]`` int64, bytes of each line with its end.
-        first: ``[N]`` int64, position of each line's first word; undefined for blank lines.
-        sizes: ``[N]`` int64, number of words.
-    """
-
-    def __init__(self, text: bytes) -> None:
-        self.data = np.frombuffer(text if text.endswith(b"\n") else text + b"\n", np.uint8)
-        blank = is_blank(self.data)
-        words = np.flatnonzero(~blank & np.concatenate([[True], blank[:-1]]))
-        ends = np.flatnonzero(self.data == ord("\n"))
-        before = np.searchsorted(words, ends)
-        self.lengths = np.diff(ends, prepend=-1)
-        self.sizes = np.diff(before, prepend=0)
-        self.first = np.append(words, 0)[before - self.sizes]
-
-    def begin_with(self, word: bytes) -> np.ndarray:
-        """Return ``[N]`` bool, True for the lines with this first word; case-sensitive."""
-        found = self.sizes > 0
-        for place, letter in enumerate(word):
-            found &= self.data.take(self.first + place, mode="clip") == letter
-        return found & is_blank(self.data.take(self.first + len(word), mode="clip"))
-
-    def behind(self, word: bytes, lines: np.ndarray) -> bytes:
-        """Return the text of the lines ``[N]`` bool with their first word blanked."""
-        data = self.data.copy()
-        for place in range(len(word)):
-            data[self.first[lines] + place] = ord(" ")
-        return data[np.repeat(lines, self.lengths)].tobytes()
-
-
-def is_blank(letters: np.ndarray) -> np.ndarray:
-    """Return True for ASCII whitespace among ``[N]`` uint8, as C's ``isspace``."""
-    return (letters == ord(" ")) | (letters - np.uint8(ord("\t")) < 5)
-
-
 def blocks_of(text: bytes, source: str) -> Iterator[bytes]:
     """Yield a text in parts of whole lines, which bounds the memory of intermediate results.
 
@@ -144,18 +104,6 @@ def blocks_of(text: bytes, source: str) -> Iterator[bytes]:
             raise UserError(f"{source}: a line of more than {_BLOCK} characters")
         yield text[at : end or len(text)]
         at = end or len(text)
-
-
-def parse_numbers(text: bytes, count: int, kind: Any = np.float64) -> np.ndarray | None:
-    """Return the ``count`` words of a text as numbers ``[count]``; None if one is not a number."""
-    if count == 0:
-        return np.zeros(0, kind)
-    try:
-        found = np.fromstring(text, kind, sep=" ")
-    except ValueError:
-        return None
-    # "1-2" is one word but two numbers; older releases of numpy stop at an invalid word.
-    return found if len(found) == count else None
 
 
 class Rows(NamedTuple):
@@ -200,13 +148,6 @@ class Rows(NamedTuple):
         return self.values.reshape(-1, count)
 
 
-def parse_rows(text: bytes) -> Rows | None:
-    """Return the rows of a text, one a line, empty for a blank one; None if a word is no number."""
-    sizes = Lines(text).sizes if text else np.zeros(0, np.int64)
-    values = parse_numbers(text, int(sizes.sum()))
-    return None if values is None else Rows(values, sizes)
-
-
 def read_rows(text: bytes, source: str, comments: bool = False) -> Rows:
     """Read the rows of a text that are not blank; NaN and infinity are numbers here.
 
@@ -219,40 +160,36 @@ def read_rows(text: bytes, source: str, comments: bool = False) -> Rows:
         UserError: a word is not a number, there are more than ``MAX_VALUES`` numbers, or as for
             ``blocks_of``.
     """
-    found = [Rows(np.zeros(0), np.zeros(0, np.int64))]
-    left = MAX_VALUES
+    values, sizes, left = [np.zeros(0)], [np.zeros(0, np.int64)], MAX_VALUES
     for block in blocks_of(text.removeprefix(BOM), source):
-        block = without_comments(block) if comments else block
-        rows = parse_rows(block)
-        if rows is None:
-            raise _no_number(block, source, sum(len(rows.sizes) for rows in found))
-        left -= len(rows.values)
+        block = re.sub(rb"#[^\n]*", b"", block) if comments else block
+        words = np.array([len(line.split()) for line in block.split(b"\n")], np.int64)
+        count = int(words.sum())
+        try:
+            found = np.fromstring(block, sep=" ") if count else np.zeros(0)
+        except ValueError:
+            found = np.zeros(0)
+        # "1-2" is one word but two numbers; older releases of numpy stop at an invalid word.
+        if len(found) != count:
+            raise _no_number(block, source, sum(map(len, sizes)))
+        left -= count
         if left < 0:
             raise UserError(f"{source}: over {MAX_VALUES} numbers, the limit for one file")
-        found.append(Rows(rows.values, rows.sizes[rows.sizes > 0]))
-    return joined_rows(found)
-
-
-def joined_rows(parts: list[Rows]) -> Rows:
-    """Return the rows of one part or more, one after the other."""
-    return Rows(*(np.concatenate(arrays) for arrays in zip(*parts)))
+        values.append(found)
+        sizes.append(words[words > 0])
+    return Rows(np.concatenate(values), np.concatenate(sizes))
 
 
 def _no_number(block: bytes, source: str, before: int) -> UserError:
     """Return the error of the first word that is not a number, ``before`` rows from the start."""
     rows = (line.split() for line in block.split(b"\n") if not line.isspace() and line)
     words = ((word, row) for row, line in enumerate(rows, before + 1) for word in line)
-    word, row = next((found for found in words if not is_number(found[0])), (b"", before))
+    word, row = next((found for found in words if not _is_number(found[0])), (b"", before))
     shown = word[:60].decode("ascii", "replace")
     return UserError(f"{source}: could not convert '{shown}' of row {row} to a number")
 
 
-def without_comments(text: bytes) -> bytes:
-    """Return a text without what follows a ``#`` in its line."""
-    return re.sub(rb"#[^\n]*", b"", text) if b"#" in text else text
-
-
-def is_number(word: bytes) -> bool:
+def _is_number(word: bytes) -> bool:
     """Return True if a word is a number."""
     try:
         float(word)

@@ -22,13 +22,11 @@ from .gltf import gltf_parts
 from .gltf_file import open_gltf
 from .headers import Source, open_shape
 from .materials import GREY, Material, SideFiles
+from .mesh_files import ply_parts, read_off, read_stl
 from .names import MESH_SUFFIXES
 from .obj import read_obj
-from .off import read_off
-from .parts import Part, used_vertices
+from .parts import Part
 from .ply_data import parse_ply
-from .ply_mesh import ply_parts
-from .stl import read_stl
 
 _READERS: dict[str, Callable[[Source, SideFiles], Iterator[Part]]] = {
     **dict.fromkeys(
@@ -175,8 +173,8 @@ def mesh_of(found: Iterable[Part], sides: SideFiles) -> TexturedMesh:
 
 def _complete(part: Part, sides: SideFiles) -> TexturedMesh:
     """Return a part as a mesh. Raises UserError if a vertex is not finite."""
-    faces, kept = used_vertices(part.faces, len(part.vertices))
-    vertices = part.vertices if kept is None else part.vertices[kept]
+    kept, faces = np.unique(part.faces, return_inverse=True)
+    faces, vertices = faces.reshape(-1, 3), part.vertices[kept]
     if not np.isfinite(vertices).all():
         bad = len(vertices) - np.count_nonzero(np.isfinite(vertices).all(1))
         raise UserError(f"{sides.path}: {bad} of {len(vertices)} vertices are not finite")
@@ -254,12 +252,12 @@ def _without_flat(mesh: TexturedMesh) -> TexturedMesh:
     if not solid.any():
         mesh.warnings.append("no face has an area")
         return mesh
-    faces, kept = used_vertices(mesh.faces[solid], len(mesh.vertices))
+    kept, faces = np.unique(mesh.faces[solid], return_inverse=True)
     normals = mesh.given_normals
     return replace(
         mesh,
-        vertices=mesh.vertices if kept is None else mesh.vertices[kept],
-        faces=faces,
+        vertices=mesh.vertices[kept],
+        faces=faces.reshape(-1, 3),
         uvs=mesh.uvs[solid],
         colors=mesh.colors[solid],
         material_ids=mesh.material_ids[solid],

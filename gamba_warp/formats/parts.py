@@ -128,26 +128,6 @@ def _ears(places: np.ndarray, normal: np.ndarray) -> np.ndarray:
     return np.asarray(triangulate([flat]), np.int64)
 
 
-def used_vertices(faces: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray | None]:
-    """Return faces as indices into the vertices that they use.
-
-    Args:
-        faces: ``[F, 3]`` indices, 0 to ``count`` less 1.
-        count: number of vertices.
-
-    Returns:
-        ``[F, 3]`` int64; and ``[U]``, the used vertices in their order, or None for all of them.
-    """
-    if 8 * faces.size < count:  # a part of many that share their vertices
-        kept, at = np.unique(faces, return_inverse=True)
-        return at.reshape(-1, 3), kept
-    used = np.zeros(count, bool)
-    used[faces] = True
-    if used.all():
-        return faces, None
-    return (np.cumsum(used) - 1)[faces], np.flatnonzero(used)
-
-
 def strip_faces(indices: np.ndarray) -> np.ndarray:
     """Return the triangles ``[F, 3]`` of strips of vertices, with one orientation.
 

@@ -135,17 +135,14 @@ def _read_header(path: Path, file: BinaryIO) -> PlyHeader:
             case ["property"]:
                 if not elements:
                     raise UserError(f"{path}: the .ply header has a property before any element")
-                elements[-1].properties.append(_property(path, words))
+                is_list = words[1:2] == ["list"]
+                kinds = [TYPES.get(word, "") for word in words[1 + is_list : -1]]
+                if len(kinds) != 1 + is_list or not all(kinds):
+                    text = f"property '{' '.join(words[1:])[:80]}'"
+                    raise UserError(f"{path}: {text} is neither a number nor a list of numbers")
+                item = PlyProperty(words[-1].lower(), kinds[-1], kinds[0] if is_list else "")
+                elements[-1].properties.append(item)
     return PlyHeader(layout, comments, elements, start)
-
-
-def _property(path: Path, words: list[str]) -> PlyProperty:
-    is_list = words[1:2] == ["list"]
-    kinds = [TYPES.get(word, "") for word in words[1 + is_list : -1]]
-    if len(kinds) != 1 + is_list or not all(kinds):
-        text = " ".join(words[1:])[:80]
-        raise UserError(f"{path}: property '{text}' is neither a number nor a list of numbers")
-    return PlyProperty(words[-1].lower(), kinds[-1], kinds[0] if is_list else "")
 
 
 def parse_ply(source: Source) -> PlyData:

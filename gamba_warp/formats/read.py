@@ -1,4 +1,8 @@
-"""Reader of every file of a shape: Gaussians, a mesh or points, by the file's content."""
+"""Reader of every file of a shape: Gaussians, a mesh or points, by the file's content.
+
+Points are ``.xyz`` and ``.ply``, text or binary, read completely or refused: the readers of Open3D
+keep a part of a malformed file, even memory that was never written.
+"""
 
 from __future__ import annotations
 
@@ -12,25 +16,33 @@ from ..errors import UserError
 from ..files import warn_of_others
 from ..gaussians import Gaussians
 from ..images import IMAGE_SUFFIXES
-from .clouds import Cloud, cloud_of, read_xyz
 from .gaussians.glb import gltf_gaussians, has_gaussians
 from .gaussians.splat import read_splat
-from .gaussians.spz import read_spz
-from .gaussians.spz_container import GZIP, MAGIC
+from .gaussians.spz import GZIP, MAGIC, read_spz
 from .gltf import gltf_parts
 from .gltf_file import open_gltf
-from .headers import Source, open_shape
+from .headers import MAX_VALUES, Source, open_shape, read_rows
 from .materials import SideFiles
+from .mesh_files import ply_parts
 from .meshes import Y_TO_Z_UP, Y_UP, TexturedMesh, mesh_of, read_mesh
 from .names import MESH_SUFFIXES, SHAPE_SUFFIXES, SPLAT_SUFFIXES
 from .ply import TURNED, ply_gaussians
-from .ply_data import MAX_SPLATS, parse_ply
-from .ply_mesh import ply_parts
+from .ply_data import MAX_SPLATS, PlyData, parse_ply
 
 # From a file's axes to z-up, by their names.
 TO_Z_UP = {"opencv": Y_TO_Z_UP * [1.0, -1.0, -1.0], "opengl": Y_TO_Z_UP, "z-up": np.eye(3)}
 UNKNOWN = "unknown"  # axes
+MAX_POINTS = MAX_VALUES // 3
 _CONVERTED = (".sog", ".ksplat", ".rad")  # Gaussians in formats of single programs
+
+
+class Cloud(NamedTuple):
+    """Points of a file."""
+
+    positions: np.ndarray  # [N, 3] float64, finite, N > 0
+    normals: np.ndarray | None = None  # [N, 3] float64 of unit length; None if one has none
+
+
 _WORDS = {Gaussians: "Gaussians", TexturedMesh: "a mesh", Cloud: "points"}
 
 
@@ -97,7 +109,7 @@ def _read(source: Source, left_out: list[str] | None, only: type | None) -> Shap
         elif data.header.has_faces:
             kind, build = TexturedMesh, lambda: mesh_of(ply_parts(data, sides), sides)
         else:
-            kind, build = Cloud, lambda: cloud_of(path, data)
+            kind, build = Cloud, lambda: _ply_cloud(path, data)
     elif head == b"glTF" or (suffix in (".glb", ".gltf") and not spz):
         file = open_gltf(source, sides)
         kind, build = TexturedMesh, lambda: mesh_of(gltf_parts(file, sides), sides)
@@ -108,11 +120,17 @@ def _read(source: Source, left_out: list[str] | None, only: type | None) -> Shap
     elif suffix == ".splat":  # which has no header
         kind, build = Gaussians, lambda: read_splat(source, left_out)
     elif suffix == ".xyz":
-        kind, build = Cloud, lambda: read_xyz(source)
+        kind, build = Cloud, lambda: _xyz_cloud(source)
     elif suffix in MESH_SUFFIXES:
         kind, build = TexturedMesh, lambda: read_mesh(source, sides)
     else:
-        raise UserError(f"{path}: {_advice(suffix)}")
+        advice = f"not one of {', '.join(SHAPE_SUFFIXES)}"
+        if suffix in IMAGE_SUFFIXES:
+            advice = "an image; gamba reconstruct makes Gaussians of it"
+        elif suffix in _CONVERTED:
+            tool = "SuperSplat (superspl.at/editor) and splat-transform convert it to .ply"
+            advice = f"the format {suffix} is not supported; {tool}"
+        raise UserError(f"{path}: {advice}")
     if only not in (None, kind):
         raise UserError(f"{path}: contains {_WORDS[kind]}, not {_WORDS[only]}")
     shape = build()
@@ -120,21 +138,48 @@ def _read(source: Source, left_out: list[str] | None, only: type | None) -> Shap
     return ShapeFile(shape, "opencv" if kind is Gaussians else axes, comments, warnings)
 
 
+def _xyz_cloud(source: Source) -> Cloud:
+    """Return the points of a ``.xyz`` file.
+
+    Of its columns, at least three, those after the first three (normals or colours, the format does
+    not say) are checked and not used.
+    """
+    name = str(source.path)
+    table = read_rows(source.file.read(), name, comments=True).table(name)
+    if len(table) and table.shape[1] < 3:
+        raise UserError(f"{name}: {table.shape[1]} columns, expected x y z")
+    return _cloud(source.path, np.ascontiguousarray(table[:, :3]), None)
+
+
+def _ply_cloud(path: Path, data: PlyData) -> Cloud:
+    positions = data.numbers("x", "y", "z")
+    if positions is None:
+        raise UserError(f"{path}: its vertices have no x, y and z")
+    return _cloud(path, positions, data.numbers("nx", "ny", "nz"))
+
+
+def _cloud(path: Path, positions: np.ndarray, normals: np.ndarray | None) -> Cloud:
+    """Return a cloud. Raises UserError if it has no points, too many, or one is not finite."""
+    count = len(positions)
+    if count == 0:
+        raise UserError(f"{path}: contains no points")
+    if count > MAX_POINTS:
+        raise UserError(f"{path}: {count} points, over the limit of {MAX_POINTS}")
+    bad = count - np.count_nonzero(np.isfinite(positions).all(1))
+    if bad:
+        raise UserError(f"{path}: {bad} of {count} points are not finite")
+    if normals is not None:
+        with np.errstate(over="ignore"):
+            lengths = np.linalg.norm(normals, axis=1, keepdims=True)
+        normals = normals / lengths if np.isfinite(lengths).all() and lengths.all() else None
+    return Cloud(positions, normals)
+
+
 def rotation_between(axes: str, others: str) -> np.ndarray:
     """Return the rotation ``[3, 3]`` from a file's axes to others; identity if one is unknown."""
     if UNKNOWN in (axes, others):
         return np.eye(3)
     return TO_Z_UP[others].T @ TO_Z_UP[axes]
-
-
-def _advice(suffix: str) -> str:
-    """Return what to do with a file that is no shape."""
-    if suffix in IMAGE_SUFFIXES:
-        return "an image; gamba reconstruct makes Gaussians of it"
-    if suffix in _CONVERTED:
-        tool = "SuperSplat (superspl.at/editor) and splat-transform convert it to .ply"
-        return f"the format {suffix} is not supported; {tool}"
-    return f"not one of {', '.join(SHAPE_SUFFIXES)}"
 
 
 def read_gaussians(path: str | Path, left_out: list[str] | None = None) -> Gaussians:

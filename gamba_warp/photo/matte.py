@@ -7,6 +7,7 @@ import sys
 from collections.abc import Callable
 from importlib.util import find_spec
 from pathlib import Path
+from urllib.parse import urlsplit
 
 import numpy as np
 import torch
@@ -102,10 +103,12 @@ def _fetched(address: str | None, fetch: bool, say: Callable[[str], None]) -> Pa
         return path
     if address is not None and not address.startswith("https://"):
         raise UserError(f"--matte-model {address}: only addresses of https are fetched")
-    model = models.PUBLISHED[0] if address is None else models.published(address)
-    if model is None:
-        names = ", ".join(f"{known.name}.onnx" for known in models.PUBLISHED)
+    known = {f"{model.name}.onnx": model for model in models.PUBLISHED}
+    name = next(iter(known)) if address is None else urlsplit(address).path.rpartition("/")[2]
+    if name not in known:
+        names = ", ".join(known)
         raise UserError(f"--matte-model {address}: an address must end in one of {names}")
+    model = known[name]
     if not models.may_fetch() or not fetch:
         reason = "GAMBA_OFFLINE forbids fetching it" if fetch else "it may not be fetched"
     elif address is None and find_spec("pooch") is None:
@@ -116,7 +119,7 @@ def _fetched(address: str | None, fetch: bool, say: Callable[[str], None]) -> Pa
         say(f"fetching a matting model once, {model.megabytes} MB, from {found}")
         try:
             return models.fetch(model, found)
-        except models.NotFetched as error:
+        except UserError as error:
             reason = str(error)
     if address is not None:
         raise UserError(f"--matte-model {address}: {reason}")

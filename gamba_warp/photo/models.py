@@ -63,10 +63,6 @@ PUBLISHED = (
 )
 
 
-class NotFetched(Exception):
-    """Error of a failed download; the text is one line."""
-
-
 def _homes() -> tuple[Path, Path]:
     """Return rembg's folder and its former one, both of which rembg searches."""
     chosen, data = os.environ.get("U2NET_HOME"), os.environ.get("XDG_DATA_HOME")
@@ -92,12 +88,6 @@ def may_fetch() -> bool:
     return os.environ.get("GAMBA_OFFLINE", "0") in ("", "0")
 
 
-def published(address: str) -> Published | None:
-    """Return the model whose file a URL names; None for other files, without a known digest."""
-    name = urlsplit(address).path.rpartition("/")[2]
-    return next((model for model in PUBLISHED if name == f"{model.name}.onnx"), None)
-
-
 def fetch(model: Published, address: str) -> Path:
     """Fetch a model into rembg's folder, with its progress on stderr.
 
@@ -109,7 +99,7 @@ def fetch(model: Published, address: str) -> Path:
 
     Raises:
         ModuleNotFoundError: pooch is not installed.
-        NotFetched: the network is unavailable, the digest is wrong, or the file cannot be written.
+        UserError: the network is unavailable, the digest is wrong, or the file cannot be written.
     """
     import pooch
 
@@ -133,7 +123,7 @@ def fetch(model: Published, address: str) -> Path:
         names = {type(error).__name__, type(error.__context__).__name__}
         if names & {"ConnectionError", "ConnectTimeout", "ReadTimeout", "ProxyError", "SSLError"}:
             reason = f"{urlsplit(address).hostname} cannot be reached"
-        raise NotFetched(reason) from error
+        raise UserError(reason) from error
     return Path(found)
 
 

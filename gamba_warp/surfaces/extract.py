@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 import torch
@@ -15,7 +16,7 @@ from ..untrusted.ranges import check_options
 from .density import level_set
 from .options import SurfaceOptions
 from .solid import distances, solid_of
-from .texture import Texture, bake_texture, vertex_colors
+from .texture import Texture, bake_texture, point_colors, vertex_normals
 from .tsdf import fuse, look_around
 
 _SOLID_VOXELS = 96  # voxels per unit of a closed surface; 128 take twice the time
@@ -66,13 +67,12 @@ def extract_surface(gaussians: Gaussians, options: SurfaceOptions, texture: int 
         raise ValueError(f"method is {options.method!r}, which has no surface")
     check_options(options)
     gaussians = near_and_visible(gaussians.detach())
-    views = None
+    views: Any = None  # rendered where they are used
     STAGES.begin("mesh views")
     if options.method == "tsdf" or options.colors or texture:
         views = look_around(gaussians, options)
     STAGES.begin("mesh surface")
     if options.method == "tsdf":
-        assert views is not None
         support = max(1.0, options.min_support * options.views)
         mesh = fuse(views, options.voxels, options.truncation, support)
     else:
@@ -89,11 +89,10 @@ def extract_surface(gaussians: Gaussians, options: SurfaceOptions, texture: int 
         moved = float(distance.mean()), float(distance.max())
     if options.colors:
         STAGES.begin("mesh colors")
-        assert views is not None
-        colors = vertex_colors(vertices, faces, views, options.voxels)
+        normals = vertex_normals(vertices, faces)
+        colors = point_colors(vertices, normals, views, options.voxels)
     if texture:
         STAGES.begin("mesh texture")
-        assert views is not None
         image = bake_texture(vertices, faces, views, options.voxels, texture)
     STAGES.begin("mesh")  # what follows, such as its file
     return Surface(vertices, faces, colors, image, moved)

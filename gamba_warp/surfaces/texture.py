@@ -15,25 +15,6 @@ from .tsdf import CLEAR, Views
 _PADDING = 4  # texels between the pieces of the atlas
 
 
-def vertex_colors(vertices: np.ndarray, faces: np.ndarray, views: Views, voxels: int) -> np.ndarray:
-    """Return the mean colour of each vertex over the views that see it, weighted by the angle.
-
-    Args:
-        vertices: ``[V, 3]``.
-        faces: ``[F, 3]``.
-        views: images and depth.
-        voxels: number of voxels per unit; a view sees a vertex if its depth there differs by less
-            than four voxels.
-
-    Returns:
-        ``[V, 3]`` float32 in [0, 1]; an unseen vertex has the nearest seen one's colour.
-
-    Raises:
-        UserError: no view sees any vertex.
-    """
-    return point_colors(vertices, vertex_normals(vertices, faces), views, voxels)
-
-
 def vertex_normals(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
     """Return unit normals ``[V, 3]`` float64 that point outside."""
     import trimesh

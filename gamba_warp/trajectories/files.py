@@ -19,7 +19,6 @@ from typing import Annotated, Any
 import numpy as np
 import torch
 from msgspec import Meta, Struct
-from torch import Tensor
 
 from ..cameras import Cameras, from_opengl
 from ..data.layouts import check_cameras, read_cameras
@@ -128,7 +127,10 @@ def _of_nerfstudio(path: _Nerfstudio, source: str) -> CameraPath:
         kind = repr(path.camera_type)[:40]
         raise UserError(f"{source}: camera_type is {kind}; only perspective is rendered")
     width, height = round(path.render_width), round(path.render_height)
-    Ks = torch.stack([_centred(width, height, posed.fov) for posed in path.camera_path])
+    fovs = torch.tensor([posed.fov for posed in path.camera_path], dtype=torch.float64)
+    Ks = torch.eye(3, dtype=torch.float64).repeat(len(fovs), 1, 1)
+    Ks[:, 0, 0] = Ks[:, 1, 1] = 0.5 * height / torch.tan(torch.deg2rad(fovs) / 2)
+    Ks[:, 0, 2], Ks[:, 1, 2] = width / 2, height / 2
     names = [f"{source}: frame {number}" for number in range(len(Ks))]
     poses = np.reshape([posed.camera_to_world for posed in path.camera_path], (-1, 4, 4))
     sizes = [(width, height)] * len(poses)
@@ -151,15 +153,6 @@ def _of_transforms(file: Path, source: str) -> Cameras:
             K[:2] *= DEFAULT_SIDE
     views = from_opengl(torch.from_numpy(poses))
     return Cameras(views, torch.from_numpy(Ks), width, height)
-
-
-def _tensor(values: Any) -> Tensor:
-    return torch.tensor(values, dtype=torch.float64)
-
-
-def _centred(width: int, height: int, fov: float) -> Tensor:
-    focal = 0.5 * height / torch.tan(torch.deg2rad(_tensor(fov)) / 2)
-    return _tensor([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]])
 
 
 def _sized(cameras: Cameras, width: int, height: int | None) -> Cameras:

@@ -49,11 +49,8 @@ class Viewpoint:
         if fov is not None and distance is None:
             before, after = (math.tan(math.radians(angle) / 2) for angle in (self.fov, fov))
             distance = self.distance * before / after
-        return Viewpoint(
-            self.elevation if elevation is None else elevation,
-            self.distance if distance is None else distance,
-            self.fov if fov is None else fov,
-        )
+        given = {"elevation": elevation, "distance": distance, "fov": fov}
+        return replace(self, **{name: x for name, x in given.items() if x is not None})
 
 
 FRONT = Viewpoint()

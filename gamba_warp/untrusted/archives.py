@@ -46,7 +46,32 @@ class Zip:
     def __init__(self, archive: zipfile.ZipFile, source: Path) -> None:
         """Check names, kinds, sizes and number of the members."""
         self._archive, self._source = archive, source
-        self._members = _zip_members(archive, source)
+        infos = archive.infolist()
+        if len(infos) > MAX_MEMBERS:
+            raise UserError(f"{source}: {len(infos)} members, at most {MAX_MEMBERS} are supported")
+        total = sum(info.file_size for info in infos)
+        if total > MAX_BYTES:
+            raise UserError(f"{source}: unpacks to over {MAX_BYTES >> 30} GB")
+        if total > max(_SMALL, MAX_RATIO * source.stat().st_size):
+            raise UserError(f"{source}: unpacks to over {MAX_RATIO} times its size")
+        self._members: dict[str, zipfile.ZipInfo] = {}
+        folded: set[str] = set()
+        for info in infos:
+            parts_of(info.filename, str(source))
+            kind = stat.S_IFMT(info.external_attr >> 16)
+            if kind not in (0, stat.S_IFREG, stat.S_IFDIR):
+                raise UserError(f"{source}: {info.filename!r} is a link or a device")
+            if info.flag_bits & 0x1:
+                raise UserError(f"{source}: {info.filename!r} is encrypted")
+            if info.compress_type not in _METHODS:
+                raise UserError(f"{source}: {info.filename!r} uses an unsupported compression")
+            if info.is_dir():
+                continue
+            # On case-insensitive file systems the second would replace the first.
+            if info.filename.casefold() in folded:
+                raise UserError(f"{source}: {info.filename!r} occurs twice")
+            folded.add(info.filename.casefold())
+            self._members[info.filename] = info
         self.names = list(self._members)
 
     def read(self, name: str, limit: int) -> bytes:
@@ -103,34 +128,3 @@ def _check_directory(path: Path) -> None:
     stated = int.from_bytes(end[start + 12 : start + 16], "little") if start >= 0 else 0
     if stated > _DIRECTORY or end.rfind(b"PK\6\7") >= 0:  # the latter means zip64
         raise UserError(f"{path}: a zip with too many members, or over 4 GB")
-
-
-def _zip_members(archive: zipfile.ZipFile, source: Path) -> dict[str, zipfile.ZipInfo]:
-    """Files by name, after the checks of ``open_zip``."""
-    infos = archive.infolist()
-    if len(infos) > MAX_MEMBERS:
-        raise UserError(f"{source}: {len(infos)} members, at most {MAX_MEMBERS} are supported")
-    total = sum(info.file_size for info in infos)
-    if total > MAX_BYTES:
-        raise UserError(f"{source}: unpacks to over {MAX_BYTES >> 30} GB")
-    if total > max(_SMALL, MAX_RATIO * source.stat().st_size):
-        raise UserError(f"{source}: unpacks to over {MAX_RATIO} times its size")
-    found: dict[str, zipfile.ZipInfo] = {}
-    folded: set[str] = set()
-    for info in infos:
-        parts_of(info.filename, str(source))
-        kind = stat.S_IFMT(info.external_attr >> 16)
-        if kind not in (0, stat.S_IFREG, stat.S_IFDIR):
-            raise UserError(f"{source}: {info.filename!r} is a link or a device")
-        if info.flag_bits & 0x1:
-            raise UserError(f"{source}: {info.filename!r} is encrypted")
-        if info.compress_type not in _METHODS:
-            raise UserError(f"{source}: {info.filename!r} uses an unsupported compression")
-        if info.is_dir():
-            continue
-        # On case-insensitive file systems the second would replace the first.
-        if info.filename.casefold() in folded:
-            raise UserError(f"{source}: {info.filename!r} occurs twice")
-        folded.add(info.filename.casefold())
-        found[info.filename] = info
-    return found

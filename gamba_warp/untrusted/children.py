@@ -138,22 +138,19 @@ class _Child:
                 return None
             value = self.pipe.recv()
         except (OSError, EOFError, pickle.UnpicklingError):
-            return (self._death(),)
+            self.process.join(_EXIT_SECONDS)
+            end = _describe_exit(self.process.exitcode)
+            self.end()
+            if not self.ready:
+                raise RuntimeError(
+                    f"a child process exited at its start ({end}); a script must "
+                    "guard its calls with 'if __name__ == \"__main__\":'"
+                ) from None
+            return (Failed(f"its process {end}"),)
         if isinstance(value, str) and value == _READY:
             self.ready, self.start = True, time.monotonic()
             return None
         return (value[0],)
-
-    def _death(self) -> Failed:
-        self.process.join(_EXIT_SECONDS)
-        code = self.process.exitcode
-        self.end()
-        if not self.ready:
-            raise RuntimeError(
-                f"a child process exited at its start ({_describe_exit(code)}); a script must "
-                "guard its calls with 'if __name__ == \"__main__\":'"
-            )
-        return Failed(f"its process {_describe_exit(code)}")
 
     def end(self) -> None:
         """Kill the process, and wait for its end."""

@@ -67,7 +67,8 @@ def parse_document(data: bytes | str, kind: type[Kind], source: str) -> Kind:
     try:
         text = (data.encode() if isinstance(data, str) else data).removeprefix(b"\xef\xbb\xbf")
         value = msgspec.json.decode(text)
-        check_depth(value, source)
+        if isinstance(value, (dict, list)):
+            check_depth(value, source)
         return msgspec.json.decode(text, type=kind)
     except msgspec.ValidationError as error:
         raise UserError(f"{source}: {error}") from error
@@ -112,20 +113,14 @@ def value_of(text: str) -> Any:
         return text
 
 
-def check_depth(value: Any, source: str) -> None:
+def check_depth(value: Any, source: str, left: int = MAX_DEPTH) -> None:
     """Check that lists and dictionaries are nested at most ``MAX_DEPTH`` levels.
 
     Raises:
         UserError: the value is nested deeper.
     """
-    level, depth = [value], 0
-    while level:
-        if depth > MAX_DEPTH:
-            raise UserError(f"{source}: nested deeper than {MAX_DEPTH} levels")
-        inner: list[Any] = []
-        for item in level:
-            if isinstance(item, dict):
-                inner.extend(v for v in item.values() if isinstance(v, (dict, list)))
-            elif isinstance(item, (list, tuple)):
-                inner.extend(v for v in item if isinstance(v, (dict, list)))
-        level, depth = inner, depth + 1
+    if left < 0:
+        raise UserError(f"{source}: nested deeper than {MAX_DEPTH} levels")
+    for item in value.values() if isinstance(value, dict) else value:
+        if isinstance(item, (dict, list)):
+            check_depth(item, source, left - 1)

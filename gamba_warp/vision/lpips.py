@@ -55,8 +55,8 @@ class LPIPS(nn.Module):
             raise ValueError(
                 f"a is {tuple(a.shape)} and b {tuple(b.shape)}; both must be [.., H, W, 3]"
             )
-        full = precision == torch.float32
-        x, y = (self.features(image) if full else self._lower(image) for image in (a, b))
+        trunk = self.trunk if precision == torch.float32 else self.trunk.lower
+        x, y = ([_unit(part) for part in trunk(self._normalized(image))] for image in (a, b))
         return self.distance(x, y).reshape(a.shape[:-3])
 
     def features(self, images: Tensor) -> list[Tensor]:
@@ -66,10 +66,6 @@ class LPIPS(nn.Module):
             images: ``[.., H, W, 3]`` RGB in [0, 1]; all leading dimensions become B.
         """
         return [_unit(y) for y in self.trunk(self._normalized(images))]
-
-    def _lower(self, images: Tensor) -> list[Tensor]:
-        """Compute ``features`` by ``VGG16Trunk.lower``."""
-        return [_unit(y) for y in self.trunk.lower(self._normalized(images))]
 
     def _normalized(self, images: Tensor) -> Tensor:
         x = images.reshape(-1, *images.shape[-3:]).permute(0, 3, 1, 2)

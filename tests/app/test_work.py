@@ -18,6 +18,7 @@ from PIL import Image
 from gamba_warp.app import cutting, main_thread, work
 from gamba_warp.batch import STAGES
 from gamba_warp.cameras import orbit
+from gamba_warp.errors import UserError
 from gamba_warp.files import STARTER
 from gamba_warp.formats.ply import load_ply
 from gamba_warp.formats.read import read_gaussians
@@ -136,7 +137,7 @@ def test_a_doubted_cut_out_has_no_command_but_a_network(tmp_path, monkeypatch):
     assert "or use a network" in first.note
 
     def fail(*_):
-        raise models.NotFetched("github.com cannot be reached")
+        raise UserError("github.com cannot be reached")
 
     monkeypatch.setattr(models, "fetch", fail)
     refused("network cannot be fetched: github.com cannot", cutting.cut_by_network, first, options)

@@ -7,7 +7,18 @@ import torch
 import torch.nn.functional as F
 from helpers import assert_rel_rms
 from helpers.forked import python
-from helpers.mamba import block_in_float64, run, scan_in_float64
+from helpers.mamba import (
+    BATCH,
+    CHANNELS,
+    GROUPED,
+    LENGTH,
+    STATES,
+    block_in_float64,
+    block_inputs,
+    run,
+    scan_in_float64,
+    scan_inputs,
+)
 
 from gamba_warp.compat.causal_conv1d import cpp_functions
 from gamba_warp.compat.extensions import EXTENSIONS, extension
@@ -17,24 +28,13 @@ from gamba_warp.compat.mamba_ssm.ops.selective_scan_interface import (
     mamba_inner_fn_no_out_proj,
 )
 
-BATCH, CHANNELS, STATES, LENGTH, RANK = 2, 10, 3, 13, 4
 NAMES = ("u", "delta", "A", "B", "C", "D", "z", "delta_bias")
 scan, conv = extension("selective_scan_cuda"), extension("causal_conv1d_cuda")
 
 
-def given(without=(), dtype=torch.float32, groups=2):
-    rows, matrix = (BATCH, CHANNELS, LENGTH), (BATCH, groups, STATES, LENGTH)
-    made = {
-        "u": torch.randn(rows).to(dtype),
-        "delta": torch.randn(rows).to(dtype),
-        "A": -torch.rand(CHANNELS, STATES),
-        "B": torch.randn(matrix).to(dtype),
-        "C": torch.randn(matrix).to(dtype),
-        "D": torch.randn(CHANNELS),
-        "z": torch.randn(rows).to(dtype),
-        "delta_bias": torch.randn(CHANNELS),
-    }
-    return {name: None if name in without else value for name, value in made.items()}
+def given(without=(), dtype=torch.float32):
+    """Return all tensors of the scan in the order of its arguments, None for those left out."""
+    return dict.fromkeys(NAMES) | scan_inputs(GROUPED, GROUPED, dtype, without)
 
 
 def in_float64(tensors, dout):
@@ -141,7 +141,9 @@ def test_the_convolution_of_every_version(silu):
 def test_packed_sequences_reach_the_convolution():
     x, weight = torch.randn(1, CHANNELS, LENGTH), torch.randn(CHANNELS, 3)
     seq_idx = (torch.arange(LENGTH) >= 5).int()[None]
-    halves = [conv.causal_conv1d_fwd(part, weight, None, True) for part in x.split([5, 8], -1)]
+    halves = [
+        conv.causal_conv1d_fwd(part, weight, None, True) for part in x.split([5, LENGTH - 5], -1)
+    ]
     for rest in ((seq_idx,), (seq_idx, None, None)):
         assert torch.equal(
             conv.causal_conv1d_fwd(x, weight, None, *rest, True), torch.cat(halves, -1)
@@ -168,20 +170,10 @@ def test_the_update_of_every_version():
 @pytest.mark.parametrize("constant", [False, True])
 def test_the_blocks_of_the_forks(constant):
     """Without the last projection, and in both directions."""
-    rows = RANK + (0 if constant else 2 * STATES)
-    tensors = {
-        "xz": torch.randn(BATCH, 2 * CHANNELS, LENGTH),
-        "conv1d_weight": torch.randn(CHANNELS, 1, 4),
-        "conv1d_bias": torch.randn(CHANNELS),
-        "x_proj_weight": torch.randn(rows, CHANNELS) / CHANNELS**0.5,
-        "delta_proj_weight": torch.randn(CHANNELS, RANK) / RANK**0.5,
-        "A": -torch.rand(CHANNELS, STATES),
-        "D": torch.randn(CHANNELS),
-        "delta_bias": torch.randn(CHANNELS),
-    }
-    if constant:
-        tensors |= {name: torch.randn(CHANNELS, STATES) for name in "BC"}
-    ends = {"out_proj_weight": torch.randn(7, CHANNELS), "out_proj_bias": torch.randn(7)}
+    tensors = {k: v for k, v in block_inputs(constant, constant).items() if v is not None}
+    ends = {name: tensors.pop(name) for name in ("out_proj_weight", "out_proj_bias")}
+    if not constant:
+        del tensors["B_proj_bias"], tensors["C_proj_bias"]
     ends["A_b"] = -torch.rand(CHANNELS, STATES)
     for function, more in ((mamba_inner_fn_no_out_proj, {}), (bimamba_inner_fn, ends)):
         got = run(function, tensors | more)

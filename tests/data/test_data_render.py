@@ -85,10 +85,7 @@ def test_pixels_colours_and_depth_agree_with_the_cameras(tmp_path):
     colors[:, 3] = 255
     folder = tmp_path / "meshes"
     plain = load_mesh(write_box(folder / "box.ply")).normalized()[0]
-    normals = np.cross(
-        plain.vertices[plain.faces[:, 1]] - plain.vertices[plain.faces[:, 0]],
-        plain.vertices[plain.faces[:, 2]] - plain.vertices[plain.faces[:, 0]],
-    )
+    normals = trimesh.triangles.cross(plain.vertices[plain.faces])
     axis = np.abs(normals).argmax(1)
     colors[np.arange(12), axis] = 255  # faces across x red, y green, z blue
     write_box(folder / "box.ply", face_colors=colors)

@@ -64,27 +64,12 @@ def test_on_its_own_background_the_matte_changes_nothing():
     assert np.abs(back - rgb).max() < 0.071 and np.abs(back - rgb).mean() < 1e-3
 
 
-def test_enclosed_background_and_touching_objects():
-    alpha = disc(radius=25, centre=(30, 40)) - disc(radius=10, centre=(30, 40))
-    found = plain_matte(scene(alpha, RED, (1, 1, 1)))
-    assert found.rgba[30, 40, 3] == 0 and len(found.holes) == 1
-    found = plain_matte(scene(alpha, RED, (1, 1, 1)), keep_holes=True)
-    assert found.rgba[30, 40, 3] == 1 and not found.holes and found.areas[30, 40]
-    rgba = plain_matte(scene(disc(centre=(55, 40), radius=14), RED, (1, 1, 1))).rgba
-    assert rgba[59, 40, 3] == 1 and rgba[0, 0, 3] == 0  # it reaches over the lower edge
-
-
 def test_dust_does_not_move_the_object():
     alpha = disc()
     rgb = scene(alpha, RED, (1, 1, 1))
     clean = recenter(plain_matte(rgb).rgba)
     rgb[2, 2] = 0
     np.testing.assert_array_equal(recenter(plain_matte(rgb).rgba), clean)
-
-
-def test_busy_backgrounds_are_not_plain():
-    rgb = np.random.default_rng(0).random((40, 50, 3)).astype(np.float32)
-    assert plain_matte(rgb) is None
 
 
 def test_a_mask_wins_over_all(tmp_path):

@@ -4,6 +4,7 @@ import struct
 
 import numpy as np
 import pytest
+from helpers.meshes import CORNERS, XYZ, ply_head
 from helpers.refusals import refused
 
 from gamba_warp.formats.headers import open_shape
@@ -18,10 +19,8 @@ GARBAGE = ["no numbers here"] * COUNT
 KINDS = [("a.xyz", {}), ("text.ply", {"write_ascii": True}), ("binary.ply", {})]
 
 
-def ply(rows, count=COUNT):
-    axes = "".join(f"property float {axis}\n" for axis in "xyz")
-    head = f"ply\nformat ascii 1.0\nelement vertex {count}\n{axes}end_header\n"
-    return (head + "\n".join(rows)).encode()
+def ply(rows):
+    return (ply_head(vertex=(COUNT, *XYZ)) + "\n".join(rows)).encode()
 
 
 def lines(*rows):
@@ -85,10 +84,7 @@ def test_columns_and_comments(tmp_path):
 def test_lists_of_different_lengths(tmp_path, layout):
     order = ">" if "big" in layout else "<"
     faces = [([0, 1, 2], 1.5), ([0, 1, 2, 3], 2.5), ([], 3.5), ([3, 2, 1, 0, 1], 4.5)]
-    head = (
-        f"ply\nformat {layout} 1.0\nelement face 4\nproperty list uchar int vertex_indices\n"
-        "property float weight\nelement edge 1\nproperty int a\nend_header\n"
-    ).encode()
+    head = ply_head(layout, face=(4, CORNERS, "float weight"), edge=(1, "int a")).encode()
     if layout == "ascii":
         rows = [f"{len(x)} {' '.join(map(str, x))} {w}\n" for x, w in faces]
         body = "".join([*rows, "7\n"]).encode()

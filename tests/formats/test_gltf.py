@@ -6,6 +6,7 @@ import json
 
 import numpy as np
 import pytest
+import trimesh
 from helpers.meshes import glb
 from helpers.refusals import refused
 from PIL import Image
@@ -32,6 +33,8 @@ class Document:
         self.primitive = {"attributes": self.attributes, "indices": self.array(CORNERS)}
         self.tree |= {"meshes": [{"primitives": [self.primitive]}], "nodes": [{"mesh": 0}]}
         self.tree |= {"scenes": [{"nodes": [0]}]} | more
+        if "materials" in more:
+            self.primitive["material"] = 0
 
     def view(self, data):
         self.binary += bytes(-len(self.binary) % 4)
@@ -139,7 +142,6 @@ def test_colours_of_vertices_are_linear_light(tmp_path, kind, width):
 
 def test_alpha_of_vertices_counts_where_the_material_blends(tmp_path):
     document = Document(materials=[{"alphaMode": "BLEND"}])
-    document.primitive["material"] = 0
     document.attributes["COLOR_0"] = document.array(np.full((4, 4), 0.4, "<f4"))
     assert document.load(tmp_path).colors[..., 3].max() == 102
     document.tree["materials"] = [{}]
@@ -200,7 +202,6 @@ def test_alpha(tmp_path, mode, alpha, cutoff, want, painted):
     base = {"baseColorFactor": [1, 1, 1, alpha]}
     look = {"alphaMode": mode, "pbrMetallicRoughness": base} | cutoff
     document = Document(materials=[look])
-    document.primitive["material"] = 0
     if painted:
         material = document.paint(alphaMode=mode, **cutoff).tree["materials"][0]
         material["pbrMetallicRoughness"] |= base
@@ -220,7 +221,6 @@ def test_alpha(tmp_path, mode, alpha, cutoff, want, painted):
 )
 def test_a_mesh_that_would_be_invisible_is_opaque(tmp_path, look, painted):
     document = Document(materials=[look])
-    document.primitive["material"] = 0
     if painted:
         material = document.paint().tree["materials"][0]
         texture = material["pbrMetallicRoughness"]
@@ -243,7 +243,6 @@ def test_a_part_that_is_invisible_beside_others_stays_so(tmp_path):
             {},
         ]
     )
-    document.primitive["material"] = 0
     document.tree["meshes"][0]["primitives"].append(document.primitive | {"material": 1})
     mesh = document.load(tmp_path)
     assert [material.color[3] for material in mesh.materials] == [0, 1] and not mesh.warnings
@@ -254,7 +253,6 @@ def test_diffuse_and_specular(tmp_path):
     gloss = {"diffuseFactor": [0.5, 0.25, 0.125, 1], "specularFactor": [0.04, 0.04, 0.04]}
     extension = {"KHR_materials_pbrSpecularGlossiness": gloss}
     document = Document(materials=[{"extensions": extension}])
-    document.primitive["material"] = 0
     mesh = document.load(tmp_path)
     np.testing.assert_allclose(mesh.materials[0].color[:3], [0.5, 0.25, 0.125], atol=0.02)
     document.paint().tree["materials"] = [{"extensions": extension}]
@@ -273,8 +271,7 @@ def test_strips_and_fans(tmp_path):
         parts.append({"attributes": document.attributes, "mode": mode})
         parts[-1]["indices"] = document.array(np.array(indices, "u1"))
     document.tree["meshes"] = [{"primitives": parts}]
-    corners = places(document.load(tmp_path))
-    across = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    across = trimesh.triangles.cross(places(document.load(tmp_path)))
     assert across.tolist() == [[0, 0, 1]] * 6
 
 
@@ -318,7 +315,7 @@ def test_instances(tmp_path):
     turned = square[..., [1, 0, 2]] * [-3, 2, 1] + [1, 2, 3]
     np.testing.assert_allclose(places(mesh)[:2], turned, atol=1e-6)
     corners = places(mesh)
-    across = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    across = trimesh.triangles.cross(corners)
     np.testing.assert_allclose(across[:, 2], [6, 6, 1, 1])
     assert corners[2:, :, 0].max() == -5 and corners[2:, :, 0].min() == -6
     assert len(instanced().load(tmp_path).faces) == 2
@@ -341,7 +338,7 @@ def test_a_mirroring_node_keeps_the_outside(tmp_path):
     document.attributes["NORMAL"] = document.array(np.tile(np.array([0, 0, 1], "<f4"), (4, 1)))
     mesh = document.load(tmp_path)
     corners = places(mesh)
-    across = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    across = trimesh.triangles.cross(corners)
     assert (across[:, 2] == 1).all() and (mesh.normals[..., 2] == 1).all()
     assert corners[2:, :, 0].max() == 0 and corners[2:, :, 0].min() == -1
 
@@ -357,8 +354,7 @@ def test_normals_of_a_stretched_node(tmp_path):
     document.attributes["POSITION"] = document.array(points.astype("<f4"))
     document.attributes["NORMAL"] = document.array(np.tile(slope, (4, 1)).astype("<f4"))
     mesh = document.load(tmp_path)
-    corners = places(mesh)
-    across = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    across = trimesh.triangles.cross(places(mesh))
     across /= np.linalg.norm(across, axis=1, keepdims=True)
     np.testing.assert_allclose(mesh.normals, np.repeat(across[:, None], 3, 1), atol=1e-6)
 

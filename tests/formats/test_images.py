@@ -7,7 +7,17 @@ import zlib
 
 import numpy as np
 import pytest
-from helpers.images import ADOBE_RGB, DISPLAY_P3, SRGB, bad_files, colour_profile, colours, encoded
+from helpers.images import (
+    ADOBE_RGB,
+    DISPLAY_P3,
+    SRGB,
+    bad_files,
+    colour_profile,
+    colours,
+    encoded,
+    png_of,
+    png_of_size,
+)
 from helpers.refusals import refused, refused_at
 from PIL import EpsImagePlugin, Image, ImageOps
 
@@ -57,21 +67,19 @@ def test_16_bit_grey_keeps_its_range(tmp_path, suffix):
     assert (got[..., :3] == got[..., :1]).all() and (got[..., 3] == 1).all()
 
 
-def png16(values, key=None, bits=16):
-    """Return a PNG of any bit depth, which Pillow cannot write, with a transparent value."""
+def png16(values, key=None, bits=16, more=()):
+    """Return a PNG of any bit depth, which Pillow cannot write, perhaps with a transparent value.
+
+    ``more`` chunks stand before the others.
+    """
     height, width, channels = values.shape
     kind = {1: 0, 2: 4, 3: 2, 4: 6}[channels]
     high = values.astype(">u2").reshape(height, -1)
     of_bits = np.unpackbits(high.view(np.uint8), axis=1).reshape(height, -1, 16)[..., -bits:]
     rows = b"".join(b"\0" + row.tobytes() for row in np.packbits(of_bits.reshape(height, -1), 1))
-    chunks = [(b"IHDR", struct.pack(">IIBBBBB", width, height, bits, kind, 0, 0, 0))]
-    chunks += [] if key is None else [(b"tRNS", np.array(key, ">u2").tobytes())]
-    chunks += [(b"IDAT", zlib.compress(rows)), (b"IEND", b"")]
-    body = b"".join(
-        struct.pack(">I", len(data)) + name + data + struct.pack(">I", zlib.crc32(name + data))
-        for name, data in chunks
-    )
-    return b"\x89PNG\r\n\x1a\n" + body
+    head = b"IHDR", struct.pack(">IIBBBBB", width, height, bits, kind, 0, 0, 0)
+    more = more if key is None else [*more, (b"tRNS", np.array(key, ">u2").tobytes())]
+    return png_of(head, *more, (b"IDAT", zlib.compress(rows)), (b"IEND", b""))
 
 
 @pytest.mark.parametrize("channels, bits", [(1, 2), (1, 4), (1, 8), (1, 16), (3, 8), (3, 16)])
@@ -116,11 +124,7 @@ def test_a_colour_near_the_transparent_one_stays(tmp_path):
 
 def chunked(*chunks, pixel=(200, 60, 30)):
     """Return a PNG of one colour with more chunks."""
-    content = png16(np.full((2, 2, 3), pixel), bits=8)
-    for name, data in chunks:
-        crc = struct.pack(">I", zlib.crc32(name + data))
-        content = content[:33] + struct.pack(">I", len(data)) + name + data + crc + content[33:]
-    return content
+    return png16(np.full((2, 2, 3), pixel), bits=8, more=chunks)
 
 
 def numbers(*values):
@@ -304,9 +308,8 @@ def test_one_pixel_and_extreme_shapes(tmp_path):
 
 def test_a_phone_image_with_a_preview_is_one_image(tmp_path):
     """Many cameras append a second image to a JPEG (MPO); it is not an animation."""
-    content = io.BytesIO()
-    colours().save(content, "MPO", save_all=True, append_images=[colours(size=(3, 3))])
-    (tmp_path / "a.jpg").write_bytes(content.getvalue())
+    both = {"save_all": True, "append_images": [colours(size=(3, 3))]}
+    colours().save(tmp_path / "a.jpg", "MPO", **both)
     assert load_rgba(tmp_path / "a.jpg").shape == (5, 7, 4)
 
 
@@ -322,18 +325,6 @@ def test_saved_images_come_back(tmp_path):
         got = load_rgba(tmp_path / "a.png")
         want = np.broadcast_to(image.reshape(5, 7, -1), (5, 7, max(3, image.shape[-1] % 7)))
         np.testing.assert_allclose(got[..., : want.shape[2]], want, atol=0.501 / 255)
-
-
-def bare_png(width, height):
-    """Return a PNG whose header states a size, without the pixels."""
-    return png16(np.zeros((1, 1, 3), int)).replace(
-        *(
-            b"IHDR" + data + zlib.crc32(b"IHDR" + data).to_bytes(4, "big")
-            for data in (
-                struct.pack(">IIBBBBB", *size, 16, 2, 0, 0, 0) for size in ((1, 1), (width, height))
-            )
-        )
-    )
 
 
 @pytest.mark.parametrize(
@@ -352,7 +343,7 @@ def test_sizes_are_refused_by_the_header_without_a_warning(
     tmp_path, recwarn, width, height, reason
 ):
     path = tmp_path / "a.png"
-    path.write_bytes(bare_png(width, height))
+    path.write_bytes(png_of_size(width, height))
     for function in (load_rgba, load_rgba8, image_size):
         refused_at(path, reason, function, path)
     assert not recwarn.list
@@ -366,9 +357,7 @@ def test_only_a_few_formats_are_ever_opened(tmp_path, monkeypatch):
         (tmp_path / f"a.{suffix}").write_bytes(postscript)
         assert "not an image" in refused(None, load_rgba, tmp_path / f"a.{suffix}")
     for form in ("ICO", "TGA", "PCX", "SGI", "DDS", "JPEG2000", "PDF", "ICNS"):
-        content = io.BytesIO()
-        colours("RGBA" if form == "ICNS" else "RGB", (16, 16)).save(content, form)
-        (tmp_path / "a.png").write_bytes(content.getvalue())
+        colours("RGBA" if form == "ICNS" else "RGB", (16, 16)).save(tmp_path / "a.png", form)
         assert "not an image" in refused(None, load_rgba, tmp_path / "a.png"), form
 
 

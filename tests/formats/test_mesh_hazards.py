@@ -10,7 +10,7 @@ import tracemalloc
 
 import numpy as np
 import pytest
-from helpers.meshes import FACET, MTL, QUAD, gltf, write_quad
+from helpers.meshes import CORNERS, FACET, MTL, QUAD, XYZ, gltf, ply_head, write_quad
 from helpers.refusals import refused
 from PIL import Image
 
@@ -26,22 +26,22 @@ POSTSCRIPT = b"%!PS-Adobe-3.0 EPSF-3.0\n%%BoundingBox: 0 0 16 16\n%%EndComments\
 
 
 def ascii_ply(vertices, faces):
-    head = f"ply\nformat ascii 1.0\nelement vertex {len(vertices)}\n"
-    head += "".join(f"property float {axis}\n" for axis in "xyz")
-    head += f"element face {len(faces)}\nproperty list uchar int vertex_indices\nend_header\n"
+    head = ply_head(vertex=(len(vertices), *XYZ), face=(len(faces), CORNERS))
     return head + "\n".join([*vertices, *faces]) + "\n"
+
+
+def binary_ply(vertices, vertex_count, face_count, faces, corners=CORNERS):
+    head = ply_head("binary_little_endian", vertex=(vertex_count, *XYZ), face=(face_count, corners))
+    return head.encode() + np.array(vertices, "<f4").tobytes() + faces
 
 
 def counted(vertices, faces, kind="uchar", length=3):
     """Return a binary .ply of one triangle whose header states these numbers."""
-    head = f"ply\nformat binary_little_endian 1.0\nelement vertex {vertices}\n"
-    head += "".join(f"property float {axis}\n" for axis in "xyz")
-    head += f"element face {faces}\nproperty list {kind} int vertex_indices\nend_header\n"
     face = struct.pack("<B3i" if kind == "uchar" else "<I3i", length, 0, 1, 2)
-    return head.encode() + np.eye(3, dtype="<f4").tobytes() + face
+    return binary_ply(np.eye(3), vertices, faces, face, CORNERS.replace("uchar", kind))
 
 
-CORNERS = ["0 0 0", "1 0 0", "0 1 0", "0 0 1"]
+FOUR = ["0 0 0", "1 0 0", "0 1 0", "0 0 1"]
 BAD = {
     "empty.obj": ("", "the file is empty"),
     "points.obj": (V, "no faces"),
@@ -68,11 +68,11 @@ BAD = {
     "uncounted.stl": (bytes(84) + b"\1" * 50, "states no faces, but 50 bytes follow"),
     "utf16.obj": (QUAD.encode("utf-16"), "text in UTF-16"),
     "without_a_vertex.stl": (STL.replace("vertex 1 0 0\n", "", 1), "8 vertices"),
-    "word.ply": (ascii_ply(CORNERS, ["3 0 1 2", "3 0 1 x"]), "could not convert"),
-    "short_row.ply": (ascii_ply(CORNERS, ["3 0 1 2", "3 0 1"]), "a row of 3 numbers, not 4"),
-    "huge_list.ply": (ascii_ply(CORNERS, ["3 0 1 2", "1e300 0"]), "a list of length 1e+300"),
-    "half.ply": (ascii_ply(CORNERS, ["3 0 1 2", "3 0 1 1.5"]), "vertex_indices is 1.5"),
-    "vertex_word.ply": (ascii_ply([*CORNERS, "0 0 x"], ["3 0 1 2"]), "could not convert"),
+    "word.ply": (ascii_ply(FOUR, ["3 0 1 2", "3 0 1 x"]), "could not convert"),
+    "short_row.ply": (ascii_ply(FOUR, ["3 0 1 2", "3 0 1"]), "a row of 3 numbers, not 4"),
+    "huge_list.ply": (ascii_ply(FOUR, ["3 0 1 2", "1e300 0"]), "a list of length 1e+300"),
+    "half.ply": (ascii_ply(FOUR, ["3 0 1 2", "3 0 1 1.5"]), "vertex_indices is 1.5"),
+    "vertex_word.ply": (ascii_ply([*FOUR, "0 0 x"], ["3 0 1 2"]), "could not convert"),
     "vertices.ply": (counted(10**12, 1), "invalid header"),
     "faces.ply": (counted(3, 10**12), "invalid header"),
     "text.ply": (counted(10**12, 1).replace(b"binary_little_endian", b"ascii"), "text.ply"),
@@ -101,10 +101,8 @@ def test_bad_meshes_are_one_line(tmp_path, name):
 
 
 def mixed(indices):
-    head = ascii_ply(CORNERS, ["", ""]).partition("end_header\n")[0] + "end_header\n"
-    body = np.array([row.split() for row in CORNERS], "<f4").tobytes()
     rows = b"".join(struct.pack(f"<B{len(row)}i", len(row), *row) for row in indices)
-    return head.replace("ascii", "binary_little_endian").encode() + body + rows
+    return binary_ply([row.split() for row in FOUR], 4, len(indices), rows)
 
 
 def test_polygons_of_different_lengths(tmp_path):

@@ -5,7 +5,7 @@ import struct
 import numpy as np
 import pytest
 import trimesh
-from helpers.meshes import FACET, MTL, QUAD, write_quad
+from helpers.meshes import CORNERS, FACET, MTL, QUAD, XYZ, ply_head, write_quad
 from helpers.refusals import refused
 from PIL import Image
 
@@ -37,17 +37,16 @@ def places(mesh):
 
 
 def areas(points, faces):
-    corners = points[faces]
-    return np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]) / 2
+    return trimesh.triangles.cross(points[faces]) / 2
 
 
 def ply(rows, faces, colours="", face_colours="", head="", kind="uchar"):
-    names = "".join(f"property {kind} {name}\n" for name in colours.split())
-    of_faces = "".join(f"property {kind} {name}\n" for name in face_colours.split())
-    text = f"ply\nformat ascii 1.0\n{head}element vertex {len(rows)}\n"
-    text += "".join(f"property float {axis}\n" for axis in "xyz") + names
-    text += f"element face {len(faces)}\nproperty list uchar int vertex_indices\n{of_faces}"
-    return text + "end_header\n" + "\n".join([*rows, *faces]) + "\n"
+    of_rows, of_faces = (
+        [f"{kind} {name}" for name in names.split()] for names in (colours, face_colours)
+    )
+    text = ply_head(vertex=(len(rows), *XYZ, *of_rows), face=(len(faces), CORNERS, *of_faces))
+    text = text.replace("element vertex", f"{head}element vertex")
+    return text + "\n".join([*rows, *faces]) + "\n"
 
 
 def cut(points, polygons):
@@ -266,11 +265,9 @@ def test_light_and_moved_textures_of_mtl(tmp_path):
 
 def test_strips_of_ply(tmp_path):
     """Every second triangle is turned; -1 ends a strip."""
-    lines = ["ply", "format ascii 1.0", "element vertex 5"]
-    lines += [f"property float {axis}" for axis in "xyz"] + ["element tristrips 2"]
-    lines += ["property list int int vertex_indices", "end_header"]
-    lines += ["0 0 0", "1 0 0", "0 1 0", "1 1 0", "2 0 0", "8 0 1 2 3 -1 1 4 3", "3 4 3 1"]
-    mesh = loaded(tmp_path, "a.ply", "\n".join([*lines, ""]))
+    head = ply_head(vertex=(5, *XYZ), tristrips=(2, "list int int vertex_indices"))
+    rows = ["0 0 0", "1 0 0", "0 1 0", "1 1 0", "2 0 0", "8 0 1 2 3 -1 1 4 3", "3 4 3 1"]
+    mesh = loaded(tmp_path, "a.ply", head + "\n".join([*rows, ""]))
     assert mesh.faces.tolist() == [[0, 1, 2], [1, 3, 2], [1, 4, 3], [4, 3, 1]]
 
 
@@ -391,13 +388,9 @@ def test_colours_of_ply(tmp_path, names, kind, scale):
 
 
 def test_a_ply_of_one_face(tmp_path):
-    head = (
-        ply(FOUR, ["4 0 1 2 3"])
-        .partition("end_header\n")[0]
-        .replace("ascii", "binary_little_endian")
-    )
+    head = ply_head("binary_little_endian", vertex=(4, *XYZ), face=(1, CORNERS))
     rows = np.array([row.split() for row in FOUR], "<f4").tobytes()
-    data = head.encode() + b"end_header\n" + rows + struct.pack("<B4i", 4, 0, 1, 2, 3)
+    data = head.encode() + rows + struct.pack("<B4i", 4, 0, 1, 2, 3)
     for content in (data, ply(FOUR, ["4 0 1 2 3"]), ply(FOUR[:3], ["3 0 1 2"])):
         assert len(loaded(tmp_path, "a.ply", content).faces) in (1, 2)
 

@@ -1,6 +1,8 @@
-"""Random Gaussians for tests of files and pages, conversions of quaternions, and a .glb's bytes."""
+"""Random Gaussians for tests of files and pages, and the bytes of a .glb and an .spz."""
 
+import gzip
 import json
+import struct
 
 import numpy as np
 import torch
@@ -75,3 +77,34 @@ def khr_glb(gaussians):
         **{"buffers": [{"byteLength": len(binary)}], "bufferViews": views, "accessors": accessors},
     }
     return glb(json.dumps(tree).encode(), binary)
+
+
+ZSTD = b"\x28\xb5\x2f\xfd"
+
+
+def raw_frame(data):
+    """A ZSTD frame of one raw block, built by the format's description without a library."""
+    block = (len(data) << 3 | 1).to_bytes(3, "little")
+    return ZSTD + b"\xa0" + struct.pack("<I", len(data)) + block + data
+
+
+def spz_4(streams, count, degree, bits=12, pack=raw_frame, extensions=b"", **other):
+    """An .spz of version 4; ``other`` replaces values of the header and of the table."""
+    frames = other.get("frames") or [pack(stream) for stream in streams]
+    sizes = other.get("sizes") or [(len(f), len(s)) for f, s in zip(frames, streams)]
+    flags = other.get("flags", 2 if extensions else 0)
+    version, number = other.get("version", 4), other.get("number", len(sizes))
+    head = struct.pack("<4sIIBBBB", b"NGSP", version, count, degree, bits, flags, number)
+    head += struct.pack("<I12x", other.get("table", 32 + len(extensions)))
+    table = b"".join(struct.pack("<QQ", *entry) for entry in sizes)
+    return head + extensions + table + b"".join(frames)
+
+
+def parts_of_spz(data):
+    """The streams, count, degree and bits of an .spz of version 3, as ``spz_4`` takes them."""
+    inner, streams, at = gzip.decompress(data), [], 16
+    count, degree, bits = struct.unpack_from("<IBB", inner, 8)
+    for each in (9, 1, 3, 3, 4, 3 * ((degree + 1) ** 2 - 1)):
+        streams += [inner[at : at + each * count]] if each else []
+        at += each * count
+    return streams, count, degree, bits

@@ -30,16 +30,19 @@ def encoded(form):
     return bytes_of(colours(size=(40, 30)), form)
 
 
+def png_of(*chunks):
+    """Return a PNG of chunks, each a name and its data, with their checksums."""
+    body = b"".join(
+        struct.pack(">I", len(data)) + name + data + struct.pack(">I", zlib.crc32(name + data))
+        for name, data in chunks
+    )
+    return b"\x89PNG\r\n\x1a\n" + body
+
+
 def png_of_size(width, height):
     """A PNG whose header states a size, with hardly any data."""
-
-    def chunk(kind, data):
-        crc = struct.pack(">I", zlib.crc32(kind + data))
-        return struct.pack(">I", len(data)) + kind + data + crc
-
     header = struct.pack(">IIBBBBB", width, height, 8, 2, 0, 0, 0)
-    body = chunk(b"IHDR", header) + chunk(b"IDAT", zlib.compress(b"\0" * 999)) + chunk(b"IEND", b"")
-    return b"\x89PNG\r\n\x1a\n" + body
+    return png_of((b"IHDR", header), (b"IDAT", zlib.compress(b"\0" * 999)), (b"IEND", b""))
 
 
 # Columns of linear red, green and blue to XYZ at D50, as the published profiles hold them.

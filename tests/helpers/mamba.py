@@ -3,6 +3,49 @@
 import torch
 import torch.nn.functional as F
 
+BATCH, CHANNELS, STATES, LENGTH, RANK, WIDTH = 2, 10, 3, 21, 4, 7
+# Shapes of B and C: the same for all tokens, varying with them, and in two groups.
+CONSTANT, VARYING = (CHANNELS, STATES), (BATCH, STATES, LENGTH)
+GROUPED = (BATCH, 2, STATES, LENGTH)
+
+
+def scan_inputs(B, C, dtype=torch.float32, without=()):
+    """Return the scan's tensors by name, B and C of these shapes; constant ones are float32."""
+    shape = (BATCH, CHANNELS, LENGTH)
+    made = {
+        "u": torch.randn(shape).to(dtype),
+        "delta": (0.5 * torch.rand(shape)).to(dtype),
+        "A": -0.5 * torch.rand(CHANNELS, STATES),
+        "B": torch.randn(B).to(torch.float32 if B == CONSTANT else dtype),
+        "C": torch.randn(C).to(torch.float32 if C == CONSTANT else dtype),
+        "D": torch.randn(CHANNELS),
+        "z": torch.randn(shape).to(dtype),
+        "delta_bias": 0.5 * torch.rand(CHANNELS),
+    }
+    return {name: x for name, x in made.items() if name not in without}
+
+
+def block_inputs(constant_B=False, constant_C=False, taps=4):
+    """Return mamba_inner_fn's arguments by mamba-ssm's names, in its order."""
+    rows = RANK + STATES * ((not constant_B) + (not constant_C))
+    return {
+        "xz": torch.randn(BATCH, 2 * CHANNELS, LENGTH),
+        "conv1d_weight": torch.randn(CHANNELS, 1, taps),
+        "conv1d_bias": torch.randn(CHANNELS),
+        "x_proj_weight": torch.randn(rows, CHANNELS) / CHANNELS**0.5,
+        "delta_proj_weight": torch.randn(CHANNELS, RANK) / RANK**0.5,
+        "out_proj_weight": torch.randn(WIDTH, CHANNELS),
+        "out_proj_bias": torch.randn(WIDTH),
+        "A": -torch.rand(CHANNELS, STATES),
+        "B": torch.randn(CHANNELS, STATES) if constant_B else None,
+        "C": torch.randn(CHANNELS, STATES) if constant_C else None,
+        "D": torch.randn(CHANNELS),
+        "delta_bias": torch.randn(CHANNELS),
+        "B_proj_bias": None if constant_B else torch.randn(STATES),
+        "C_proj_bias": None if constant_C else torch.randn(STATES),
+    }
+
+
 # Of x = delta A: the decay of the state, and the factor of delta B u.
 TRANSITIONS = {
     "mamba": lambda x: (x.exp(), 1.0),

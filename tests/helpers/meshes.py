@@ -25,6 +25,8 @@ usemtl paint
 f 1/1 2/2 3/3 4/4
 """
 MTL = "newmtl paint\nKd 0.1 0.1 0.1\nmap_Kd paint.png\n"
+# Properties in a .ply.
+XYZ, CORNERS = ("float x", "float y", "float z"), "list uchar int vertex_indices"
 QUARTERS = np.array([[[255, 0, 0], [0, 255, 0]], [[0, 0, 255], [255, 255, 0]]], np.uint8)
 
 
@@ -56,6 +58,14 @@ def glb(tree: dict | bytes, binary: bytes) -> bytes:
     chunks = struct.pack("<I4s", len(text), b"JSON") + text
     chunks += struct.pack("<I4s", len(binary), b"BIN\0") + binary
     return struct.pack("<4sII", b"glTF", 2, 12 + len(chunks)) + chunks
+
+
+def ply_head(form: str = "ascii", **elements: tuple) -> str:
+    """The header of a .ply; an element has its count and its properties."""
+    lines = ["ply", f"format {form} 1.0"]
+    for name, (count, *properties) in elements.items():
+        lines += [f"element {name} {count}", *(f"property {each}" for each in properties)]
+    return "\n".join([*lines, "end_header", ""])
 
 
 def render_views(folder, out, **options):

@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from helpers.images import png_of
 from helpers.meshes import glb
 from hypothesis import strategies as st
 
@@ -104,11 +105,7 @@ def png_chunks(draw: Draw, data: bytes) -> bytes:
         chunks.insert(1, (name, start + _bomb(BOMB // 16)))
     else:
         chunks.insert(1, (b"acTL", struct.pack(">II", choice(draw, 2, 2**31 - 1), 0)))
-    out = b"\x89PNG\r\n\x1a\n"
-    for name, body in chunks:
-        out += struct.pack(">I", len(body)) + name + body
-        out += struct.pack(">I", zlib.crc32(name + body))
-    return out
+    return png_of(*chunks)
 
 
 def torch_values(draw: Draw, data: bytes) -> bytes:

@@ -2,7 +2,6 @@
 
 import base64
 import functools
-import gzip
 import io
 import json
 import struct
@@ -16,7 +15,7 @@ import numpy as np
 import torch
 import trimesh
 from helpers import micro
-from helpers.gaussians import khr_glb, some
+from helpers.gaussians import khr_glb, parts_of_spz, some, spz_4
 from helpers.images import ADOBE_RGB, bytes_of, colour_profile
 from helpers.matting import matting_network
 from helpers.released import theirs
@@ -150,26 +149,10 @@ def splats() -> Kinds:
     for kind in ("compressed-ply", "splat", "spz", "glb"):
         name = "object." + ("ply" if kind == "compressed-ply" else kind)
         seeds[f"gaussians-{kind}"] = {name: gaussians(300 if "ply" in kind else 12, kind, 1)}
-    return seeds | {"gaussians-spz-4": {"object.spz": spz_4(gaussians(12, "spz", 1))}}
-
-
-def spz_4(data: bytes) -> bytes:
-    """An ``.spz`` of version 3 in the container of version 4, with an extension.
-
-    Each ZSTD frame is uncompressed, so mutations reach the numbers, too.
-    """
-    inner = gzip.decompress(data)
-    magic, _, count, degree, bits, flags, _ = struct.unpack_from("<4sIIBBBB", inner)
-    sizes = [count * each for each in (9, 1, 3, 3, 4, 3 * ((degree + 1) ** 2 - 1)) if each]
-    extension = struct.pack("<III", 0xADBE0003, 4, 4)  # the axes are the usual ones
-    table, frames, at = b"", b"", 16
-    for size in sizes:
-        block = struct.pack("<I", size << 3 | 1)[:3]  # the last one, raw
-        frame = b"\x28\xb5\x2f\xfd\xa0" + struct.pack("<I", size) + block + inner[at : at + size]
-        table += struct.pack("<QQ", len(frame), size)
-        frames, at = frames + frame, at + size
-    head = struct.pack("<4sIIBBBB", magic, 4, count, degree, bits, flags | 2, len(sizes))
-    return head + struct.pack("<I12x", 32 + len(extension)) + extension + table + frames
+    # Its frames are uncompressed, so that mutations reach the numbers; the extension is the axes.
+    axes = struct.pack("<III", 0xADBE0003, 4, 4)
+    four = spz_4(*parts_of_spz(gaussians(12, "spz", 1)), extensions=axes)
+    return seeds | {"gaussians-spz-4": {"object.spz": four}}
 
 
 def thinned_splats() -> Kinds:

@@ -23,12 +23,11 @@ from gamba_warp.surfaces.extract import (
     cleaned_mesh,
     extract_surface,
     unit_frame,
-    vertex_colors,
 )
 from gamba_warp.surfaces.files import save_mesh
 from gamba_warp.surfaces.options import SurfaceOptions
 from gamba_warp.surfaces.solid import distances, solid_of
-from gamba_warp.surfaces.texture import Texture
+from gamba_warp.surfaces.texture import Texture, point_colors, vertex_normals
 from gamba_warp.surfaces.tsdf import CLEAR, Views, fuse, look_around, sphere_cameras
 from gamba_warp.versions import import_open3d
 
@@ -144,7 +143,8 @@ def test_an_unseen_vertex_takes_the_nearest_color():
     inside = np.array([[0.0, 0, 0], [0.01, 0, 0], [0, 0.01, 0]])
     vertices = np.concatenate([ball.vertices, inside])
     faces = np.concatenate([ball.faces, [np.arange(3) + len(ball.vertices)]])
-    assert np.abs(vertex_colors(vertices, faces, views, 64) - 0.5).max() < 0.02
+    normals = vertex_normals(vertices, faces)
+    assert np.abs(point_colors(vertices, normals, views, 64) - 0.5).max() < 0.02
 
 
 def test_space_that_is_seen_through_is_cleared():

@@ -10,7 +10,6 @@ from functools import partial
 from typing import Any
 
 from ..absent import complete
-from .optimizer import SelectiveAdam, adam
 from .pixels import isect_offset_encode, isect_tiles, rasterize_to_pixels
 from .projection import (
     fully_fused_projection,
@@ -19,7 +18,7 @@ from .projection import (
     spherical_harmonics,
     world_to_cam,
 )
-from .relocation import quat_scale_to_covar_preci, quat_to_rotmat
+from .relocation import SelectiveAdam, adam, quat_scale_to_covar_preci, quat_to_rotmat
 from .rendering import CameraModel, RasterizeMode, RenderMode, RollingShutterType, rasterization
 
 __all__ = [

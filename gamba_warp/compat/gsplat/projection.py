@@ -19,7 +19,7 @@ from gamba_warp.kernels.rasterize.constants import (
 from gamba_warp.kernels.rasterize.harmonics import sums_seen_from
 from gamba_warp.kernels.rasterize.projection import ProjectionOptions
 
-from ..shared import at_least_0, check_tensor, one_device, one_of, positive, side
+from ..shared import check_tensor, one_device, one_of, side
 from .relocation import quat_scale_to_covar_preci
 
 MAX_SH_DEGREE = 4
@@ -46,6 +46,18 @@ class Splats(NamedTuple):
     depths: Tensor
     opacities: Tensor
     extents: Tensor
+
+
+def check_bounds(near_plane: float, eps2d: float) -> None:
+    """Refuse a near plane that is not above 0, and a dilation below 0.
+
+    Raises:
+        ValueError: one is so.
+    """
+    if not near_plane > 0:
+        raise ValueError(f"near_plane must be > 0, got {near_plane}")
+    if not eps2d >= 0:
+        raise ValueError(f"eps2d must be >= 0, got {eps2d}")
 
 
 def check_scene(tensors: dict[str, Any], covariance: tuple[int, ...]) -> tuple[int, ...]:
@@ -301,8 +313,7 @@ def fully_fused_projection(
     """
     one_of("sparse_grad", sparse_grad, False)
     one_of("camera_model", camera_model, "pinhole")
-    positive(near_plane=near_plane)
-    at_least_0(eps2d=eps2d)
+    check_bounds(near_plane, eps2d)
     width, height = side(width=width, height=height)
     tensors: dict[str, Any] = dict(means=means, viewmats=viewmats, Ks=Ks)
     tensors |= dict(quats=quats, scales=scales) if covars is None else dict(covars=covars)

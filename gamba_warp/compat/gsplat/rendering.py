@@ -15,9 +15,9 @@ from gamba_warp.kernels.rasterize.harmonics import colors_seen_from
 from gamba_warp.kernels.rasterize.projection import ProjectionOptions
 from gamba_warp.kernels.rasterize.tiles import Bins, Tiling
 
-from ..shared import at_least_0, check_tensor, one_device, one_of, positive, side
+from ..shared import check_tensor, one_device, one_of, side
 from .pixels import SKIP, blend, pair_ids
-from .projection import MAX_SH_DEGREE, check_scene, flat, plain_conics, project_views
+from .projection import MAX_SH_DEGREE, check_bounds, check_scene, flat, plain_conics, project_views
 
 # Unsupported arguments, which must have their defaults. ``tile_size``, ``channel_chunk`` and
 # ``segmented`` have no effect, and ``rolling_shutter`` may be gsplat's own ``GLOBAL``; all others
@@ -107,8 +107,7 @@ def rasterization(
     one_of("render_mode", render_mode, "RGB", "D", "ED", "RGB+D", "RGB+ED")
     one_of("rasterize_mode", rasterize_mode, "classic", "antialiased")
     one_of("sh_degree", sh_degree, None, *range(MAX_SH_DEGREE + 1))
-    positive(near_plane=near_plane)
-    at_least_0(eps2d=eps2d)
+    check_bounds(near_plane, eps2d)
     width, height = side(width=width, height=height)
     tensors: dict[str, Any] = dict(means=means, viewmats=viewmats, Ks=Ks, opacities=opacities)
     tensors |= dict(quats=quats, scales=scales) if covars is None else dict(covars=covars)

@@ -94,25 +94,21 @@ def unpacked(path: Path, data: PlyData) -> dict[str, np.ndarray]:
     three = (_split(words[:, 1] & 0x3FFFFFFF, (10, 10, 10)) - 0.5) * np.sqrt(2)
     with np.errstate(over="ignore"):
         scales = np.exp(logs)
+    rest = np.zeros((count, 0))
+    if found := data.elements.get("sh", {}):
+        rest = _table(path, data, "sh", rest_names(len(found)), np.uint8)
+    if len(rest) != count:
+        raise UserError(f"{path}: invalid header, {count} vertices but {len(rest)} harmonics")
+    # The middle of each step, but the ends are the ends.
+    middle = np.where(rest == 0, 0.0, np.where(rest == 255, 1.0, (rest + 0.5) / 256))
     return {
         "means": means,
         "quats": from_smallest_three((words[:, 1] >> 30).astype(np.int64), three),
         "scales": scales,
         "opacities": rgba[:, 3],
         "colors": colors,
-        "harmonics": _harmonics(path, data, count),
+        "harmonics": harmonics_of(path, (middle - 0.5) * 2 * _REACH),
     }
-
-
-def _harmonics(path: Path, data: PlyData, count: int) -> np.ndarray:
-    if not (found := data.elements.get("sh", {})):
-        return np.zeros((count, 0, 3))
-    table = _table(path, data, "sh", rest_names(len(found)), np.uint8)
-    if len(table) != count:
-        raise UserError(f"{path}: invalid header, {count} vertices but {len(table)} harmonics")
-    # The middle of each step, but the ends are the ends.
-    middle = np.where(table == 0, 0.0, np.where(table == 255, 1.0, (table + 0.5) / 256))
-    return harmonics_of(path, (middle - 0.5) * 2 * _REACH)
 
 
 def _table(

@@ -9,13 +9,12 @@ import tracemalloc
 import pytest
 import torch
 from helpers import refusals
-from helpers.gaussians import rotations, some
+from helpers.gaussians import ZSTD, parts_of_spz, raw_frame, rotations, some, spz_4
 
 from gamba_warp.formats.gaussians.files import write_gaussians
 from gamba_warp.formats.read import read_gaussians
 from gamba_warp.gaussians import SH_C0
 
-MAGIC = b"\x28\xb5\x2f\xfd"
 SAFE_ORBIT = struct.pack("<IIfff", 0xADBE0002, 12, -0.5, 1.0, 0.3)
 
 
@@ -26,28 +25,10 @@ def zstd():
         return pytest.importorskip("backports.zstd")
 
 
-def raw_frame(data):
-    """Return a frame of one raw block, built by the format's description without a library."""
-    block = (len(data) << 3 | 1).to_bytes(3, "little")
-    return MAGIC + b"\xa0" + struct.pack("<I", len(data)) + block + data
-
-
 def bomb(blocks):
     """Return a frame of blocks that repeat one byte 131,072 times, in a window of 2 MB."""
     repeat = ((1 << 17) << 3 | 2).to_bytes(3, "little") + b"\0"
-    return MAGIC + b"\x00\x58" + repeat * blocks + b"\1\0\0"
-
-
-def container(streams, count, degree, bits=12, pack=raw_frame, extensions=b"", **other):
-    """Return the file; ``other`` replaces values of the header and of the table."""
-    frames = other.get("frames") or [pack(stream) for stream in streams]
-    sizes = other.get("sizes") or [(len(f), len(s)) for f, s in zip(frames, streams)]
-    flags = other.get("flags", 2 if extensions else 0)
-    version, number = other.get("version", 4), other.get("number", len(sizes))
-    head = struct.pack("<4sIIBBBB", b"NGSP", version, count, degree, bits, flags, number)
-    head += struct.pack("<I12x", other.get("table", 32 + len(extensions)))
-    table = b"".join(struct.pack("<QQ", *entry) for entry in sizes)
-    return head + extensions + table + b"".join(frames)
+    return ZSTD + b"\x00\x58" + repeat * blocks + b"\1\0\0"
 
 
 def two(degree=1):
@@ -66,7 +47,7 @@ def two(degree=1):
 @pytest.mark.parametrize("extensions", [b"", SAFE_ORBIT, struct.pack("<III", 0xADBE0003, 4, 4)])
 def test_the_numbers_of_a_file_by_the_layout(tmp_path, degree, extensions):
     path = tmp_path / "a.spz"
-    path.write_bytes(container(two(degree), 2, degree, extensions=extensions))
+    path.write_bytes(spz_4(two(degree), 2, degree, extensions=extensions))
     got = read_gaussians(path)
     # The file has y up and z backward; what is read has both turned.
     want = torch.tensor([[1.0, 2.5, -0.25], [0.0, -1 / 4096, 1 / 4096]])
@@ -94,17 +75,12 @@ def test_packed_streams_are_those_of_version_3(tmp_path, degree):
     """Packed by the library, of more than one block of 128 kB, with a checksum or without."""
     count = 15_000 if degree == 0 else 5_003
     write_gaussians(tmp_path / "three.spz", some(count, degree=degree), "spz")
-    inner, streams = gzip.decompress((tmp_path / "three.spz").read_bytes()), []
-    at, bits = 16, inner[13]
-    for each in (9, 1, 3, 3, 4, 3 * ((degree + 1) ** 2 - 1)):
-        streams += [inner[at : at + each * count]] if each else []
-        at += each * count
+    streams, *numbers = parts_of_spz((tmp_path / "three.spz").read_bytes())
     module = zstd()
     checked = {module.CompressionParameter.checksum_flag: 1}
     for options in ({}, checked):
         packed = [module.compress(stream, options=options) for stream in streams]
-        data = container(streams, count, degree, bits, frames=packed)
-        (tmp_path / "four.spz").write_bytes(data)
+        (tmp_path / "four.spz").write_bytes(spz_4(streams, *numbers, frames=packed))
         want, got = (read_gaussians(tmp_path / f"{name}.spz") for name in ("three", "four"))
         for name in ("means", "quats", "scales", "opacities", "colors"):
             assert torch.equal(getattr(want, name), getattr(got, name)), name
@@ -126,7 +102,7 @@ def refused(path, data, *words):
 @pytest.mark.parametrize("pack", [raw_frame, lambda data: zstd().compress(data)])
 def test_cut_short_anywhere(tmp_path, pack):
     zstd()
-    data = container(two(), 2, 1, pack=pack, extensions=SAFE_ORBIT)
+    data = spz_4(two(), 2, 1, pack=pack, extensions=SAFE_ORBIT)
     for length in range(4, len(data)):
         refused(tmp_path / "a.spz", data[:length], "truncated")
     refused(tmp_path / "a.spz", data + bytes(3), "invalid header")
@@ -169,14 +145,14 @@ def test_a_header_or_a_table_that_lies(tmp_path, case):
     change, word = LIES[case]
     refused(
         tmp_path / "a.spz",
-        container(**({"streams": two(), "count": 2, "degree": 1} | change)),
+        spz_4(**({"streams": two(), "count": 2, "degree": 1} | change)),
         word,
     )
 
 
 def far(size):
     """Return a raw frame that states, or has a window of, ``size`` bytes."""
-    return MAGIC + b"\xe0" + struct.pack("<Q", size) + (18 << 3 | 1).to_bytes(3, "little")
+    return ZSTD + b"\xe0" + struct.pack("<Q", size) + (18 << 3 | 1).to_bytes(3, "little")
 
 
 FRAMES = {
@@ -201,14 +177,14 @@ def test_a_stream_that_is_something_else(tmp_path, case):
         checked = {module.CompressionParameter.checksum_flag: 1}
         frame = frame(module.compress(two()[0], options=checked))
     frames = [frame, *map(raw_frame, two()[1:])]
-    refused(tmp_path / "a.spz", container(two(), 2, 1, frames=frames), word)
+    refused(tmp_path / "a.spz", spz_4(two(), 2, 1, frames=frames), word)
 
 
 def test_a_small_file_of_many_equal_gaussians_is_taken_for_a_bomb(tmp_path):
     """29 million bytes by 1,000: more than the reference library takes, too."""
     streams = [bytes(1_000_000 * each) for each in (9, 1, 3, 3, 4, 9)]
     frames = [bomb(len(stream) >> 17) for stream in streams]
-    data = container(streams, 1_000_000, 1, frames=frames)
+    data = spz_4(streams, 1_000_000, 1, frames=frames)
     del streams
     refused(tmp_path / "a.spz", data, "29000000 bytes")
 
@@ -216,7 +192,7 @@ def test_a_small_file_of_many_equal_gaussians_is_taken_for_a_bomb(tmp_path):
 def test_without_the_library_one_line_says_how_to_get_it(tmp_path, monkeypatch):
     for name in ("compression", "compression.zstd", "backports.zstd"):
         monkeypatch.setitem(sys.modules, name, None)
-    (tmp_path / "a.spz").write_bytes(container(two(), 2, 1))
+    (tmp_path / "a.spz").write_bytes(spz_4(two(), 2, 1))
     assert refusals.refused(None, read_gaussians, tmp_path / "a.spz") == (
         f"{tmp_path / 'a.spz'}: .spz of version 4 needs backports.zstd, which is not installed:"
         " pip install '.[spz]' in the checkout, or 'FILE.whl[spz]'"
