@@ -7,7 +7,7 @@ import re
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import BinaryIO, NamedTuple
+from typing import Any, BinaryIO, NamedTuple
 
 import numpy as np
 
@@ -106,6 +106,18 @@ def blocks_of(text: bytes, source: str) -> Iterator[bytes]:
         at = end or len(text)
 
 
+def parse_numbers(text: bytes, count: int, kind: Any = np.float64) -> np.ndarray | None:
+    """Return the ``count`` words of a text as numbers ``[count]``; None if one is not a number."""
+    if count == 0:
+        return np.zeros(0, kind)
+    try:
+        found = np.fromstring(text, kind, sep=" ")
+    except ValueError:
+        return None
+    # "1-2" is one word but two numbers; older releases of numpy stop at an invalid word.
+    return found if len(found) == count else None
+
+
 class Rows(NamedTuple):
     """Rows of numbers."""
 
@@ -148,6 +160,14 @@ class Rows(NamedTuple):
         return self.values.reshape(-1, count)
 
 
+def parse_rows(text: bytes) -> Rows | None:
+    """Return the rows of a text, one a line, empty for a blank one; None if a word is no number."""
+    lines = text.removesuffix(b"\n").split(b"\n") if text else []
+    sizes = np.array([len(line.split()) for line in lines], np.int64)
+    values = parse_numbers(text, int(sizes.sum()))
+    return None if values is None else Rows(values, sizes)
+
+
 def read_rows(text: bytes, source: str, comments: bool = False) -> Rows:
     """Read the rows of a text that are not blank; NaN and infinity are numbers here.
 
@@ -160,36 +180,40 @@ def read_rows(text: bytes, source: str, comments: bool = False) -> Rows:
         UserError: a word is not a number, there are more than ``MAX_VALUES`` numbers, or as for
             ``blocks_of``.
     """
-    values, sizes, left = [np.zeros(0)], [np.zeros(0, np.int64)], MAX_VALUES
+    found = [Rows(np.zeros(0), np.zeros(0, np.int64))]
+    left = MAX_VALUES
     for block in blocks_of(text.removeprefix(BOM), source):
-        block = re.sub(rb"#[^\n]*", b"", block) if comments else block
-        words = np.array([len(line.split()) for line in block.split(b"\n")], np.int64)
-        count = int(words.sum())
-        try:
-            found = np.fromstring(block, sep=" ") if count else np.zeros(0)
-        except ValueError:
-            found = np.zeros(0)
-        # "1-2" is one word but two numbers; older releases of numpy stop at an invalid word.
-        if len(found) != count:
-            raise _no_number(block, source, sum(map(len, sizes)))
-        left -= count
+        block = without_comments(block) if comments else block
+        rows = parse_rows(block)
+        if rows is None:
+            raise _no_number(block, source, sum(len(rows.sizes) for rows in found))
+        left -= len(rows.values)
         if left < 0:
             raise UserError(f"{source}: over {MAX_VALUES} numbers, the limit for one file")
-        values.append(found)
-        sizes.append(words[words > 0])
-    return Rows(np.concatenate(values), np.concatenate(sizes))
+        found.append(Rows(rows.values, rows.sizes[rows.sizes > 0]))
+    return joined_rows(found)
+
+
+def joined_rows(parts: list[Rows]) -> Rows:
+    """Return the rows of one part or more, one after the other."""
+    return Rows(*(np.concatenate(arrays) for arrays in zip(*parts)))
 
 
 def _no_number(block: bytes, source: str, before: int) -> UserError:
     """Return the error of the first word that is not a number, ``before`` rows from the start."""
     rows = (line.split() for line in block.split(b"\n") if not line.isspace() and line)
     words = ((word, row) for row, line in enumerate(rows, before + 1) for word in line)
-    word, row = next((found for found in words if not _is_number(found[0])), (b"", before))
+    word, row = next((found for found in words if not is_number(found[0])), (b"", before))
     shown = word[:60].decode("ascii", "replace")
     return UserError(f"{source}: could not convert '{shown}' of row {row} to a number")
 
 
-def _is_number(word: bytes) -> bool:
+def without_comments(text: bytes) -> bytes:
+    """Return a text without what follows a ``#`` in its line."""
+    return re.sub(rb"#[^\n]*", b"", text) if b"#" in text else text
+
+
+def is_number(word: bytes) -> bool:
     """Return True if a word is a number."""
     try:
         float(word)

@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import re
-from array import array
 from collections.abc import Iterator
-from itertools import chain
 from pathlib import Path
 
 import numpy as np
@@ -13,19 +11,16 @@ from PIL import Image
 
 from ..color_spaces import to_linear
 from ..errors import UserError
-from .headers import BOM, Rows, Source, blocks_of
+from .headers import BOM, Rows, Source, blocks_of, is_number, joined_rows, parse_numbers
 from .materials import GREY, Material, SideFiles, plain
 from .parts import Part, color_range, cut_polygons, to_rgba8
 
 MAX_MATERIALS = 20_000  # of a file: each is a part
 MAX_LIBRARIES = 100  # MTL files of a file
+_DIGITS = 15  # of an index
 _NO_NUMBER = re.compile(rb"-?1\.#(IND|INF|QNAN|SNAN)\d*")  # as Microsoft's libraries print them
-# A corner of a face: 7, 7/8, 7//9 or 7/8/9; some programs write slashes behind it.
-_CORNER = re.compile(
-    rb"(-?0*[1-9]\d{0,14})(?:/(-?0*\d{1,15})?(?:/(-?0*\d{1,15})?)?)?(?:(?<=\d)//?)?"
-)
-# By the first word of a line: a place in lists, and the least numbers behind it.
-_LEAST = {b"v": (0, 3), b"vt": (1, 1), b"vn": (2, 3)}
+_CORNER = re.compile(rb"-?0*[1-9]\d{0,14}(/(-?\d{1,15})?){0,2}")
+_LEAST = {b"v": 3, b"vt": 1, b"vn": 3}  # numbers of a line at least, by its first word
 # Statements that change neither shape nor colours.
 _IGNORED = {"g", "o", "s", "mg", "lod", "bevel", "shadow_obj", "trace_obj"}
 
@@ -49,17 +44,19 @@ def read_obj(source: Source, sides: SideFiles) -> Iterator[Part]:
     del text
     for word in sorted(found.unread - _IGNORED)[:9]:
         sides.omit(f"the statement {word} is not read")
-    vertices, uvs, normals = found.rows
+    vertices, uvs, normals = map(joined_rows, found.rows.values())
     points, colors = _vertices(vertices)
     # A texture may have one coordinate.
     vertex_uvs, vertex_normals = uvs.columns(0, 1), normals.columns(0, 1, 2)
     vertex_uvs[uvs.sizes < 2, 1] = 0.0
-    corners, lengths, group = found.corners - 1, found.lengths, found.materials
+    corners, lengths = np.concatenate(found.corners) - 1, np.concatenate(found.lengths)
     places = cut_polygons(sides, points, corners[:, 0], lengths)
     beyond = corners >= [len(points), len(vertex_uvs), len(vertex_normals)]
     if beyond.any():
         sides.warnings.append("faces name texture coordinates or normals that are not there")
         corners[beyond] = -1
+    at, used = np.transpose(found.used)
+    group = used[np.searchsorted(at, np.concatenate(found.faces)) - 1]
     if (lengths != 3).any():
         group = np.repeat(group, np.maximum(lengths - 2, 0))
     numbers, first = np.unique(group, return_index=True)
@@ -104,64 +101,116 @@ class _Statements:
     """Statements of a file.
 
     Attributes:
-        rows: numbers of the lines of ``v``, ``vt`` and ``vn``.
-        corners: ``[C, 3]`` int64, of each corner the indices of v, vt and vn from 1, or 0.
-        lengths: ``[F]`` int64, number of corners of each face.
-        materials: ``[F]`` int64, number of each face's material.
+        rows: numbers of the lines of ``v``, ``vt`` and ``vn``, by block.
+        corners: by block ``[C, 3]`` int64, of each corner the indices of v, vt and vn from 1, or 0.
+        lengths: by block ``[F]``, number of corners of each face.
+        faces: by block ``[F]``, line of each face.
         names: numbers of the materials by name; 0 for faces without a material.
+        used: lines of usemtl, and numbers of the materials.
         libraries: names of MTL files.
         unread: first words of other statements.
     """
 
     def __init__(self, path: Path, text: bytes) -> None:
-        values = [array("d") for _ in _LEAST]  # of v, vt and vn
-        sizes, corners = [array("q") for _ in _LEAST], array("q")
-        lengths, materials = array("q"), array("q")
+        none = np.zeros(0, np.int64)
+        self.rows = {word: [Rows(np.zeros(0), none)] for word in _LEAST}
+        self.corners, self.lengths, self.faces = [np.zeros((0, 3), np.int64)], [none], [none]
         self.libraries, self.unread = list[str](), set[str]()
-        self.names, material = {"": 0}, 0
-        blocks = (block.removesuffix(b"\n").split(b"\n") for block in blocks_of(text, str(path)))
-        for number, line in enumerate(chain.from_iterable(blocks), 1):
+        self.names = {"": 0}
+        self.used = [(-1, 0)]
+        self._totals = np.zeros(3, np.int64)  # of v, vt and vn in the blocks before
+        line = 0
+        for block in blocks_of(text, str(path)):
+            lines = block.removesuffix(b"\n").split(b"\n")
+            if not self._read(path, lines, line):
+                raise _invalid_line(path, lines, line)
+            line += len(lines)
+
+    def _read(self, path: Path, lines: list[bytes], start: int) -> bool:
+        """Read a block whose first line has this number; return False if a line is invalid."""
+        words: dict[bytes, list[bytes]] = {word: [] for word in (*_LEAST, b"f")}
+        sizes: dict[bytes, list[int]] = {word: [] for word in words}  # words of each line
+        faces, before = [], []  # lines of faces; numbers of v, vt and vn before each
+        for number, line in enumerate(lines, start):
             word = next(iter(line.split(maxsplit=1)), b"")
-            before = line.partition(b"#")[0]
-            words = before.split()
-            if word == b"f":
-                found = [corner for x in words[1:] if (corner := _CORNER.fullmatch(x))]
-                if len(found) < len(words) - 1:
-                    raise _invalid_line(path, number, words)
-                indices = [int(x) for corner in found for x in corner.groups(b"0")]
-                if b"-" in before:  # negative ones count back from their line
-                    counts = [len(x) + 1 for x in sizes] * len(found)
-                    indices = [i + n if i < 0 else i for i, n in zip(indices, counts)]
-                corners.extend(indices)
-                lengths.append(len(words) - 1)
-                materials.append(material)
-            elif word in _LEAST:
-                place, least = _LEAST[word]
-                try:
-                    values[place].extend(map(float, words[1:]))
-                except ValueError:
-                    raise _invalid_line(path, number, words) from None
-                if len(words) <= least or b"_" in before:
-                    raise _invalid_line(path, number, words)
-                sizes[place].append(len(words) - 1)
+            if word in words:
+                more = line.partition(b"#")[0].split()[1:]
+                words[word] += more
+                sizes[word].append(len(more))
+                if word == b"f":
+                    faces.append(number)
+                    before.append([len(sizes[other]) for other in _LEAST])
             elif word in (b"mtllib", b"usemtl"):
                 name = line.strip()[len(word) :].decode("utf-8", "replace").strip()
                 if word == b"mtllib":
                     self.libraries.append(name)
                 else:
-                    material = self.names.setdefault(name, len(self.names))
+                    self.used.append((number, self.names.setdefault(name, len(self.names))))
             elif word.isalpha() and word.islower():
                 self.unread.add(word[:30].decode())
-        self.rows = [Rows(np.array(x), np.array(size)) for x, size in zip(values, sizes)]
-        self.corners = np.array(corners).reshape(-1, 3)
-        self.lengths, self.materials = np.array(lengths), np.array(materials)
-        if (self.corners < [1, 0, 0]).any():
-            raise UserError(f"{path}: a face refers to a vertex before the first")
+        for word, least in _LEAST.items():
+            values = parse_numbers(b" ".join(words[word]), len(words[word]))
+            if values is None or min(sizes[word], default=least) < least:
+                return False
+            self.rows[word].append(Rows(values, np.array(sizes[word], np.int64)))
+        corners, lengths = _corners(words[b"f"]), np.array(sizes[b"f"], np.int64)
+        if corners is None:
+            return False
+        if (corners < 0).any():  # they count back from their own line
+            totals = self._totals + np.array(before)
+            corners += np.where(corners < 0, np.repeat(totals, lengths, axis=0) + 1, 0)
+            if (corners < [1, 0, 0]).any():
+                raise UserError(f"{path}: a face refers to a vertex before the first")
+        self._totals += [len(sizes[word]) for word in _LEAST]
+        self.corners.append(corners)
+        self.lengths.append(lengths)
+        self.faces.append(np.array(faces, np.int64))
+        return True
 
 
-def _invalid_line(path: Path, number: int, words: list[bytes]) -> UserError:
-    shown = b" ".join(words)[:60].decode("ascii", "replace")
-    return UserError(f"{path}: line {number}, '{shown}', is not a valid vertex or face")
+def _corners(words: list[bytes]) -> np.ndarray | None:
+    """Read the corners of faces: ``7``, ``7/8``, ``7//9`` or ``7/8/9``.
+
+    Returns:
+        ``[C, 3]`` int64, the indices as written, 0 where one is missing; None if one is invalid.
+    """
+    text = b" ".join(words) + b" "
+    letters = np.frombuffer(text, np.uint8)
+    slash = letters == ord("/")
+    inside = (letters - np.uint8(ord("0")) < 10) | (letters == ord("-"))
+    if not (inside | slash | (letters == ord(" "))).all() or b"///" in text:
+        return None
+    starts = np.flatnonzero(inside & ~np.append(False, inside[:-1]))
+    numbers = parse_numbers(text.replace(b"/", b" "), len(starts), np.int64)
+    if numbers is None or (np.abs(numbers) >= 10**_DIGITS).any():
+        return None
+    # Steps from one number to the next: a slash, two, or none before the first of a corner.
+    steps = slash[starts - 1].astype(np.int8) + (slash[starts - 1] & slash[starts - 2])
+    heads = np.flatnonzero(steps == 0)
+    if len(heads) != len(words):  # a corner begins with a slash
+        return None
+    within = np.arange(len(starts)) - np.repeat(heads, np.diff(heads, append=len(starts)))
+    places = steps + np.where(within == 2, np.roll(steps, 1), 0)
+    if (within > 2).any() or (places > 2).any():
+        return None
+    corners = np.zeros((len(heads), 3), np.int64)
+    corners[np.cumsum(steps == 0) - 1, places] = numbers
+    return None if (corners[:, 0] == 0).any() else corners
+
+
+def _invalid_line(path: Path, lines: list[bytes], before: int) -> UserError:
+    """Return the error of the first invalid line of a block, ``before`` lines from the start."""
+    for number, line in enumerate(lines, before + 1):
+        words = line.partition(b"#")[0].split() or [b""]
+        if words[0] == b"f":
+            valid = all(_CORNER.fullmatch(word) for word in words[1:])
+        else:
+            least = _LEAST.get(words[0], 0)
+            valid = words[0] not in _LEAST or len(words) > least and all(map(is_number, words[1:]))
+        if not valid:
+            shown = b" ".join(words)[:60].decode("ascii", "replace")
+            return UserError(f"{path}: line {number}, '{shown}', is not a valid vertex or face")
+    return UserError(f"{path}: not a valid .obj file")
 
 
 def _bare(name: str) -> str:
