@@ -29,7 +29,7 @@ class _Lower(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx: Any, x: Tensor, trunk: VGG16Trunk) -> tuple[Tensor, ...]:
-        outputs, kept, places = [], [], []
+        outputs, activations, places = [], [], []
         for block, layers in enumerate(CONVS):
             if block:
                 x, place = F.max_pool2d(x, 2, return_indices=True)
@@ -38,25 +38,25 @@ class _Lower(torch.autograd.Function):
             for number in map(str, layers):
                 layer = trunk.features[number] if block < FULL_BLOCKS else trunk.rounded[number]
                 x = F.relu_(layer(x))
-                kept.append(x)
+                activations.append(x)
             outputs.append(x)
-        ctx.save_for_backward(*kept, *places)
+        ctx.save_for_backward(*activations, *places)
         ctx.turned = trunk.turned
         return tuple(outputs)
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, *cotangents: Tensor) -> tuple[Tensor, None]:
-        kept, places = list(ctx.saved_tensors[:_LAYERS]), list(ctx.saved_tensors[_LAYERS:])
+        activations, places = list(ctx.saved_tensors[:_LAYERS]), list(ctx.saved_tensors[_LAYERS:])
         passed = None
         for block, layers in reversed(list(enumerate(CONVS))):
-            own = cotangents[block].bfloat16()
-            passed = own if passed is None else passed.add_(own)
+            cotangent = cotangents[block].bfloat16()
+            passed = cotangent if passed is None else passed.add_(cotangent)
             for number in reversed(layers):
-                passed = torch.where(kept.pop() > 0, passed, 0.0)
+                passed = torch.where(activations.pop() > 0, passed, 0.0)
                 passed = F.conv2d(passed, ctx.turned[str(number)], padding=1)
             if block:
-                before = kept[-1].to(passed.dtype)
+                before = activations[-1].to(passed.dtype)
                 square = ([2, 2], [2, 2], [0, 0], [1, 1], False)
                 pool = torch.ops.aten.max_pool2d_with_indices_backward
                 passed = pool(passed, before, *square, places.pop())

