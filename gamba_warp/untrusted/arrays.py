@@ -58,9 +58,9 @@ def _parse(data: bytes, shape: tuple[int, ...]) -> np.ndarray:
         raise UserError(f"expected {wanted} numbers, its header states {got}")
     if not _NUMBERS.fullmatch(dtype.str):
         raise UserError(f"it holds {dtype.str[:40]}, not numbers")
-    numbers = data[file.tell() :]
-    if len(numbers) != dtype.itemsize * math.prod(shape):
-        raise UserError(f"expected {wanted} numbers, it holds {len(numbers)} bytes of them")
-    array = np.ndarray(shape, dtype, numbers, order="F" if columns_first else "C")
+    body = data[file.tell() :]
+    if len(body) != dtype.itemsize * math.prod(shape):
+        raise UserError(f"expected {wanted} numbers, it holds {len(body)} bytes of them")
+    array = np.ndarray(shape, dtype, body, order="F" if columns_first else "C")
     with np.errstate(over="ignore", invalid="ignore"):
         return array.astype(np.float64)

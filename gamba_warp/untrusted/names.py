@@ -59,8 +59,8 @@ class Within:
         """Names in a subfolder except links; empty if it is missing or leaves the folder."""
         try:
             folder = inside(self._folder, "/".join(above), source) if above else self._folder
-            with os.scandir(folder) as found:
-                return {entry.name for entry in found if not entry.is_symlink()}
+            with os.scandir(folder) as entries:
+                return {entry.name for entry in entries if not entry.is_symlink()}
         except (UserError, OSError):
             return set()
 

@@ -137,8 +137,8 @@ def _ranges(owner: Callable) -> dict[str, list[Meta]]:
 
 def _limits(hint: Any) -> list[Meta]:
     """All ranges in a type: its own and its parts'."""
-    found = [part for part in getattr(hint, "__metadata__", ()) if isinstance(part, Meta)]
-    return found + [limits for part in typing.get_args(hint) for limits in _limits(part)]
+    ranges = [part for part in getattr(hint, "__metadata__", ()) if isinstance(part, Meta)]
+    return ranges + [limits for part in typing.get_args(hint) for limits in _limits(part)]
 
 
 def option(name: str) -> str:
