@@ -187,7 +187,7 @@ class CutOut:
         return over_background(small, GREY)
 
 
-class _Found(NamedTuple):
+class _Result(NamedTuple):
     """Result of a method: ``[H, W, 4]``, enclosed areas ``[H, W]``, words for ``_HOW``, a doubt."""
 
     method: Method
@@ -236,21 +236,21 @@ def cut_out(path: str | Path, options: CutoutOptions | None = None) -> CutOut:
     if method == "alpha":
         rgba, fringe = without_matte(rgba)
     elif method == "mask":
-        given, rgba = rgba, without_background(source, rgba[..., 3])
-        fringe = "background" if (rgba[..., 3] < given[..., 3]).any() else None
-    found = None if method is None else _Found(method, rgba)
-    if found is None:
+        before, rgba = rgba, without_background(source, rgba[..., 3])
+        fringe = "background" if (rgba[..., 3] < before[..., 3]).any() else None
+    result = None if method is None else _Result(method, rgba)
+    if result is None:
         try:
-            found = _cut_by_methods(path, source, options)
+            result = _cut_by_methods(path, source, options)
         except UserError:
             if not few:
                 raise
-    if found is None or few and not found.rgba[..., 3].any():
-        found = _Found("alpha", rgba)  # the object may well fill the image
-    method, rgba = found.method, found.rgba
+    if result is None or few and not result.rgba[..., 3].any():
+        result = _Result("alpha", rgba)  # the object may well fill the image
+    method, rgba = result.method, result.rgba
     close, around = rgba, source
     if options.recenter:
-        close, around = _at_own_pixels(path, whole, source, found, options)
+        close, around = _at_own_pixels(path, whole, source, result, options)
     try:
         centred = recenter(close, BORDER_RATIO if options.recenter else None)
     except ValueError as error:
@@ -259,20 +259,20 @@ def cut_out(path: str | Path, options: CutoutOptions | None = None) -> CutOut:
     how = _HOW[method].format(
         mask=Path(options.mask or "").name,
         model=model and model.path.name,
-        holes=found.holes,
-        why=found.why,
+        holes=result.holes,
+        why=result.why,
         fringe=f", without the {fringe} mixed into its edge" if fringe else "",
     )
     if options.recenter and (pixels := round((1 - BORDER_RATIO) * len(centred))) < _FEW_PIXELS:
         how += f" Its longer side has {pixels} pixels, so the result is blurred."
     if (most := rgba[..., 3].max()) < _OPAQUE:
         how += f" It is at most {most:.0%} opaque, so the result is faint, too."
-    doubt, advice, own = "", "", method in ("mask", "alpha", "none")
-    doubts = [] if own else doubts_of(source, rgba[..., 3])
+    doubt, advice, trusted = "", "", method in ("mask", "alpha", "none")
+    doubts = [] if trusted else doubts_of(source, rgba[..., 3])
     if method == "mask" and (edge := _on_border(rgba[..., 3] > 0.5)) > _BORDER:
         inverted = " (is the mask inverted?)" if edge > _MOST_EDGE else ""
         doubts.append(f"it touches the image's border{inverted}")
-    doubts += [found.doubt] if found.doubt else []
+    doubts += [result.doubt] if result.doubt else []
     if method == "grabcut":  # docs/reconstruct.md has the figure
         doubts.append("colours alone fail for more than half of photographs")
     if doubts:
@@ -282,7 +282,7 @@ def cut_out(path: str | Path, options: CutoutOptions | None = None) -> CutOut:
             about = f"{best.name}, {best.megabytes} MB, {best.licence}, fetched once"
             advice = f" Try a network: gamba reconstruct --cutout matte ({about})."
     editable = np.dstack([np.where(close[..., 3:] > 0, close[..., :3], around), close[..., 3]])
-    areas = np.zeros(rgba.shape[:2], bool) if found.areas is None else found.areas > 0
+    areas = np.zeros(rgba.shape[:2], bool) if result.areas is None else result.areas > 0
     return CutOut(
         centred, method, how, source, rgba[..., 3], editable, doubt + advice, areas, doubt
     )
@@ -292,7 +292,7 @@ def _at_own_pixels(
     path: str | Path,
     whole: np.ndarray,
     source: np.ndarray,
-    found: _Found,
+    result: _Result,
     options: CutoutOptions,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return an object that is small in the reduced image as it is in the whole one.
@@ -301,14 +301,14 @@ def _at_own_pixels(
         path: named in errors.
         whole: ``[H, W, 4]``, the image with its alpha or the mask's.
         source: ``[h, w, 3]``, the reduced image.
-        found: its cut-out in the reduced image.
+        result: its cut-out in the reduced image.
         options: options.
 
     Returns:
         ``[h, w, 4]``, the object and what is around it, and ``[h, w, 3]``, the image there; or
         the reduced image's.
     """
-    rgba, scale = found.rgba, len(whole) / len(found.rgba)
+    rgba, scale = result.rgba, len(whole) / len(result.rgba)
     rows, columns = (np.flatnonzero((rgba[..., 3] > PRESENT).any(axis)) for axis in (1, 0))
     if scale < 1.1 or not len(rows):
         return rgba, source
@@ -324,13 +324,13 @@ def _at_own_pixels(
     part = whole[tuple(slice(round(a * scale), round(b * scale)) for a, b in box)]
     part = shrink(part, WORKING_SIZE)
     around = part[..., :3]
-    if found.method == "alpha":
+    if result.method == "alpha":
         return without_matte(part)[0], around
-    if found.method == "mask":
+    if result.method == "mask":
         return without_background(around, part[..., 3]), around
     alpha = resize(small, *part.shape[:2])[..., 0].clip(0, 1)
     same = copy.copy(options)  # with its opened networks
-    same.cutout = "matte" if found.method == "sam" else found.method
+    same.cutout = "matte" if result.method == "sam" else result.method
     try:
         again = _cut_by_methods(path, around, same).rgba
     except UserError:  # it is all of the part
@@ -355,7 +355,7 @@ def _methods(options: CutoutOptions) -> list[Method]:
     return ["plain", "matte", "grabcut"]
 
 
-def _cut_by_methods(path: str | Path, rgb: np.ndarray, options: CutoutOptions) -> _Found:
+def _cut_by_methods(path: str | Path, rgb: np.ndarray, options: CutoutOptions) -> _Result:
     """Return the result of the first successful method, with the failures of earlier ones."""
     reasons: list[str] = []
     for method in _methods(options):
@@ -368,7 +368,7 @@ def _cut_by_methods(path: str | Path, rgb: np.ndarray, options: CutoutOptions) -
                     holes = counted(len(plain.holes), "enclosed area")
                     said = f", with {holes} of it (--keep-holes keeps them)" if plain.holes else ""
                     doubt = _LIKE_GROUND if plain.alike else ""
-                    return _Found("plain", plain.rgba, plain.areas, said, why, doubt)
+                    return _Result("plain", plain.rgba, plain.areas, said, why, doubt)
             if options.cutout == "plain":
                 reasons.append("its border is not plain")
             continue
@@ -383,7 +383,7 @@ def _cut_by_methods(path: str | Path, rgb: np.ndarray, options: CutoutOptions) -
             continue
         fault = fault_of(alpha)
         if fault is None:
-            return _Found(method, _blended(rgb, alpha), why=why)
+            return _Result(method, _blended(rgb, alpha), why=why)
         reasons.append(f"{_NAMES[method]}: {fault}")
     raise UserError(
         f"{path}: cannot tell object from background ({'; '.join(reasons)}); give an image with a "
@@ -398,15 +398,15 @@ def doubts_of(rgb: np.ndarray, alpha: np.ndarray) -> list[str]:
         rgb: the image, ``[H, W, 3]`` in [0, 1].
         alpha: ``[H, W]`` in [0, 1].
     """
-    inside, found = alpha > 0.5, []
+    inside, doubts = alpha > 0.5, []
     if _on_border(inside) > _BORDER:
-        found.append("it touches the image's border")
+        doubts.append("it touches the image's border")
     if find_spec("skimage") is not None:
         from skimage.measure import label
 
         sizes = np.bincount(np.asarray(label(inside)).ravel())[1:]
         if (parts := int((sizes >= _PART * sizes.max(initial=1)).sum())) > 1:
-            found.append(f"it has {parts} separate parts")
+            doubts.append(f"it has {parts} separate parts")
     planes = planes_of(alpha[..., None])
     grown = torch.nn.functional.max_pool2d(planes, 3, 1, 1)[0, 0].numpy() > 0.5
     outline = grown & ~inside
@@ -414,12 +414,12 @@ def doubts_of(rgb: np.ndarray, alpha: np.ndarray) -> list[str]:
     weak = np.abs(ours - theirs).max(-1)[outline] < _MIN_EDGE_CONTRAST
     alike = weak.mean() if outline.any() else 0.0
     if alike > _MAX_WEAK_FRACTION:
-        found.append(f"along {alike:.0%} of its outline it looks like the background")
+        doubts.append(f"along {alike:.0%} of its outline it looks like the background")
     unsure = ((planes > 0.1) & (planes < 0.9)).float()
     wide = -torch.nn.functional.max_pool2d(-unsure, 5, 1, 2)
     if float((wide * planes).sum()) > _MAX_SOFT_FRACTION * float(planes.sum()):
-        found.append("parts of it are half transparent")
-    return found
+        doubts.append("parts of it are half transparent")
+    return doubts
 
 
 def _on_border(inside: np.ndarray) -> float:

@@ -92,8 +92,8 @@ def _narrowed(
         background: ``[H, W, 3]``; None for the local mean outside the boundary.
     """
     width = max(2, max(rgb.shape[:2]) // _WIDTH)
-    own = planes_of(alpha[..., None])
-    solid = (own > 0.5).float()
+    opacity = planes_of(alpha[..., None])
+    solid = (opacity > 0.5).float()
     near, known = _around(rgb, _eroded(solid, width + 1)[0, 0].numpy(), width + 3)
     boundary = (solid > _eroded(solid, width)) & (known > 0)
     if background is None:
@@ -104,7 +104,7 @@ def _narrowed(
         theirs = planes_of(background)
     added, full = planes_of(rgb) - near, theirs - near
     fraction = (_dot(added, full) / _dot(full, full).clamp(min=1e-3)).clamp(0, 1)
-    excess = (fraction - (1 - own)).clamp(min=0)
+    excess = (fraction - (1 - opacity)).clamp(min=0)
     whole, left = (_dot(x, x)[boundary].double() for x in (added, added - fraction * full))
     is_mixed = (
         len(whole) >= _LEAST
@@ -112,7 +112,7 @@ def _narrowed(
         and left.sum() < _RIM_UNEXPLAINED * whole.sum()
         and excess[boundary].mean() > _EXCESS
     )
-    return torch.where(boundary, own - excess, own)[0, 0].numpy() if is_mixed else alpha
+    return torch.where(boundary, opacity - excess, opacity)[0, 0].numpy() if is_mixed else alpha
 
 
 def _dot(a: Tensor, b: Tensor) -> Tensor:

@@ -49,8 +49,8 @@ def grabcut(rgb: np.ndarray) -> np.ndarray:
     small = (max(4, round(height * factor)), max(4, round(width * factor)))
     inside = _connected(planes_of(_cut(resize(rgb, *small))[..., None]))
     alpha = planes_of(resize(inside[0, 0, ..., None].numpy(), height, width))
-    found = _guided_filter(alpha, planes_of(rgb), max(1, round(1 / factor)))
-    return found[0, 0].clamp(0, 1).numpy()
+    filtered = _guided_filter(alpha, planes_of(rgb), max(1, round(1 / factor)))
+    return filtered[0, 0].clamp(0, 1).numpy()
 
 
 def _cut(colors: np.ndarray) -> np.ndarray:
@@ -79,14 +79,14 @@ def _log_density(colors: np.ndarray, where: np.ndarray) -> np.ndarray:
     chosen, flat = colors[where], colors.reshape(-1, 3)
     nearest = _nearest(chosen, _k_means(chosen))
     parts = []
-    for own in (chosen[nearest == k] for k in range(_PARTS)):
-        if len(own) == 0:
+    for cluster in (chosen[nearest == k] for k in range(_PARTS)):
+        if len(cluster) == 0:
             continue
-        off = own - own.mean(0)
-        spread = off.T @ off / len(own) + _LEAST_SPREAD * np.eye(3)
+        off = cluster - cluster.mean(0)
+        spread = off.T @ off / len(cluster) + _LEAST_SPREAD * np.eye(3)
         factor = np.linalg.inv(np.linalg.cholesky(spread))
-        scaled = (flat - own.mean(0)) @ factor.T
-        norm = np.log(len(own) / len(chosen)) + np.log(factor.diagonal()).sum()
+        scaled = (flat - cluster.mean(0)) @ factor.T
+        norm = np.log(len(cluster) / len(chosen)) + np.log(factor.diagonal()).sum()
         parts.append(norm - 0.5 * (scaled * scaled).sum(1))
     most = np.max(parts, axis=0)
     return (most + np.log(np.exp(parts - most).sum(0))).reshape(where.shape)
@@ -94,12 +94,12 @@ def _log_density(colors: np.ndarray, where: np.ndarray) -> np.ndarray:
 
 def _k_means(colors: np.ndarray) -> np.ndarray:
     """Return k-means centres ``[K, 3]``, initialised deterministically by the farthest colours."""
-    last, distance, found = colors.mean(0), np.full(len(colors), np.inf), []
+    last, distance, seeds = colors.mean(0), np.full(len(colors), np.inf), []
     for _ in range(_PARTS):
         distance = np.minimum(distance, ((colors - last) ** 2).sum(1))
         last = colors[distance.argmax()]
-        found.append(last)
-    centres = np.stack(found)
+        seeds.append(last)
+    centres = np.stack(seeds)
     for _ in range(_MEANS):
         nearest = _nearest(colors, centres)
         for k in np.unique(nearest):
@@ -169,14 +169,14 @@ def _ends(plane: np.ndarray, offset: tuple[int, int]) -> tuple[np.ndarray, np.nd
 def _connected(inside: Tensor) -> Tensor:
     """Return the components that touch the middle half, ``[1, 1, h, w]`` of 0 and 1."""
     height, width = inside.shape[-2:]
-    found, before = torch.zeros_like(inside), None
+    reached, before = torch.zeros_like(inside), None
     middle = np.s_[..., height // 4 : height - height // 4, width // 4 : width - width // 4]
-    found[middle] = inside[middle]
-    while before is None or not torch.equal(found, before):
-        before = found
+    reached[middle] = inside[middle]
+    while before is None or not torch.equal(reached, before):
+        before = reached
         for _ in range(8):
-            found = functional.max_pool2d(found, 3, 1, 1) * inside
-    return found
+            reached = functional.max_pool2d(reached, 3, 1, 1) * inside
+    return reached
 
 
 def _guided_filter(alpha: Tensor, image: Tensor, radius: int) -> Tensor:

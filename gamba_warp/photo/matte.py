@@ -60,10 +60,10 @@ class Matte:
             if not self.path.is_file():
                 reason = "not a plain file" if self.path.exists() else "no such file"
                 raise UserError(f"--matte-model {self.path}: {reason}")
-            found = os.stat(self.path)
-            if found.st_size > MAX_MODEL:
+            status = os.stat(self.path)
+            if status.st_size > MAX_MODEL:
                 raise UserError(f"--matte-model {self.path}: is over {MAX_MODEL >> 30} GB")
-            self._version = found.st_size, found.st_mtime_ns
+            self._version = status.st_size, status.st_mtime_ns
             self._run(None)
 
     def __call__(self, rgb: np.ndarray) -> np.ndarray:
@@ -115,10 +115,10 @@ def _fetched(address: str | None, fetch: bool, say: Callable[[str], None]) -> Pa
         raise NoMatte(f"pooch, which fetches it, is not installed: {to_install('photo')}")
     else:
         require("pooch")
-        found = address or model.address
-        say(f"fetching a matting model once, {model.megabytes} MB, from {found}")
+        url = address or model.address
+        say(f"fetching a matting model once, {model.megabytes} MB, from {url}")
         try:
-            return models.fetch(model, found)
+            return models.fetch(model, url)
         except UserError as error:
             reason = str(error)
     if address is not None:

@@ -110,7 +110,7 @@ def fetch(model: Published, address: str) -> Path:
         progressbar=bar, timeout=_SECONDS, hooks={"response": _stays_secure}
     )
     try:
-        found = pooch.retrieve(
+        path = pooch.retrieve(
             address,
             known_hash=f"sha256:{model.sha256}",
             fname=f"{model.name}.onnx",
@@ -124,7 +124,7 @@ def fetch(model: Published, address: str) -> Path:
         if names & {"ConnectionError", "ConnectTimeout", "ReadTimeout", "ProxyError", "SSLError"}:
             reason = f"{urlsplit(address).hostname} cannot be reached"
         raise UserError(reason) from error
-    return Path(found)
+    return Path(path)
 
 
 def _stays_secure(response: Any, **options: Any) -> None:

@@ -158,7 +158,7 @@ def _holes(areas: np.ndarray, residual: np.ndarray, noise: float) -> tuple[list[
     """Return the numbers of the enclosed areas that are background, and of others so coloured."""
     difference = np.abs(residual).max(-1)
     widest = ndimage.maximum_filter(difference, 3)
-    found, others = [], []
+    holes, others = [], []
     for number, box in enumerate(ndimage.find_objects(areas), 1):
         if box is None:
             continue
@@ -172,10 +172,10 @@ def _holes(areas: np.ndarray, residual: np.ndarray, noise: float) -> tuple[list[
         islands = text.sum() / area.sum()
         faint = (widest[wide][ring] < _FAINT).mean()
         if bias <= max(_BIAS, noise / 3) and islands <= _ISLANDS and faint <= _FAINT_FRACTION:
-            found.append(number)
+            holes.append(number)
         elif bias <= _EXACT:
             others.append(number)
-    return found, others
+    return holes, others
 
 
 def _alike(rgb: np.ndarray, residual: np.ndarray, alpha: np.ndarray, exact: np.ndarray) -> bool:
