@@ -104,14 +104,14 @@ class _Reader:
         Beside it a mask of the vertices of its accessors that it has; both None, and a warning,
         without triangles.
         """
-        mode, given = primitive.get("mode", int, _TRIANGLES), primitive.entry("attributes")
+        mode, attributes = primitive.get("mode", int, _TRIANGLES), primitive.entry("attributes")
         if mode in _OTHERS:
             self.sides.omit(f"only triangles are read, not {_OTHERS[mode]}")
             return None, None
-        if "POSITION" not in given.values:
+        if "POSITION" not in attributes.values:
             self.sides.omit("a primitive without POSITION is ignored")
             return None, None
-        count = len(self.file.values(given.need("POSITION", Index)))
+        count = len(self.file.values(attributes.need("POSITION", Index)))
         indices = np.arange(count)
         if "indices" in primitive.values:
             indices = self.file.values(primitive.need("indices", Index))[:, 0].astype(np.int64)
@@ -123,9 +123,9 @@ class _Reader:
         faces = (np.cumsum(used) - 1)[faces]
 
         def attribute(name: str, *widths: int) -> np.ndarray | None:
-            if name not in given.values:
+            if name not in attributes.values:
                 return None
-            base = self.file.values(given.need(name, Index))
+            base = self.file.values(attributes.need(name, Index))
             if base.shape[1] not in widths or len(base) != count:
                 self.warn(f"{name} of {len(base)} x {base.shape[1]} numbers is ignored")
                 return None
@@ -211,8 +211,8 @@ class _Reader:
             else:
                 color[3], alpha = 1.0, np.where(shown, 255, 0).astype(np.uint8)
                 if (alpha != texture[..., 3]).any():
-                    kept = self.sides.claim(texture.nbytes, "an image without its transparency")
-                    texture = np.dstack([texture[..., :3], alpha]) if kept else None
+                    claimed = self.sides.claim(texture.nbytes, "an image without its transparency")
+                    texture = np.dstack([texture[..., :3], alpha]) if claimed else None
         return Material(plain(color), texture), info
 
     def glossy(self, gloss: Entry) -> tuple[np.ndarray, np.ndarray | None, Entry]:
@@ -229,16 +229,16 @@ class _Reader:
         for name, image in small.items():
             while image is not None and 4 * image.width * image.height > _GLOSSY:
                 small[name] = image = image.reduce(2)
-        found = specular_to_pbr(
+        pbr = specular_to_pbr(
             diffuseFactor=gloss.vector("diffuseFactor", _WHITE),
             specularFactor=gloss.vector("specularFactor", _WHITE[:3]),
             glossinessFactor=gloss.get("glossinessFactor", float, 1.0),
             **small,
         )
-        texture = found.get("baseColorTexture")
+        texture = pbr.get("baseColorTexture")
         texture = None if texture is None else np.array(texture.convert("RGBA"))
         info = gloss.entry(names["diffuseTexture" not in gloss.values])
-        return np.array(found.get("baseColorFactor", _WHITE)), texture, info
+        return np.array(pbr.get("baseColorFactor", _WHITE)), texture, info
 
     def texture(self, info: Entry) -> np.ndarray | None:
         """Return the image of a texture; None, and a warning, if it cannot be read."""
@@ -273,7 +273,7 @@ class _Reader:
     ) -> np.ndarray:
         """Return ``[V, 4, 4]``, matrices of a skinned primitive's used vertices in the scene."""
         skin, path = self.file.item("skins", index), self.file.path
-        chain, given = skin.need("joints", list[Index]), primitive.entry("attributes")
+        chain, attributes = skin.need("joints", list[Index]), primitive.entry("attributes")
         if not chain or not matrices.keys() >= {*chain}:
             self.sides.omit("a skin with joints outside of the scene is not applied")
             return np.eye(4)
@@ -285,9 +285,9 @@ class _Reader:
             joints = joints @ inverse[: len(joints)].reshape(-1, 4, 4).transpose(0, 2, 1)
         count = np.count_nonzero(used)
         total, sums, number = np.zeros((count, 4, 4)), np.zeros((count, 1, 1)), 0
-        while f"JOINTS_{number}" in given.values:
+        while f"JOINTS_{number}" in attributes.values:
             chosen, weights = (
-                self.file.values(given.need(f"{name}_{number}", Index))
+                self.file.values(attributes.need(f"{name}_{number}", Index))
                 for name in ("JOINTS", "WEIGHTS")
             )
             same = chosen.shape == weights.shape == (len(used), 4)

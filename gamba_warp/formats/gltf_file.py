@@ -114,9 +114,9 @@ class GltfFile:
     def content(self, uri: str) -> bytes:
         """Return the bytes of a URI: embedded data, or a file in the document's folder."""
         if not uri.startswith("data:"):
-            found = self.sides.read(unquote(uri), uri)
-            self.size += len(found)
-            return found
+            content = self.sides.read(unquote(uri), uri)
+            self.size += len(content)
+            return content
         head, _, data = uri.partition(",")
         try:
             return base64.b64decode(data) if head.endswith(";base64") else unquote_to_bytes(data)
@@ -173,11 +173,11 @@ class GltfFile:
         if sparse.values:
             count, where = sparse.need("count", Index), sparse.entry("indices")
             at = _KINDS[where.need("componentType", Literal[5121, 5123, 5125])]
-            found = self._rows(where, at, (count, 1), says)[:, 0]
-            if count and found.max() >= shape[0]:
-                raise UserError(f"{self.path}: {says} changes value {found.max()} of {shape[0]}")
+            indices = self._rows(where, at, (count, 1), says)[:, 0]
+            if count and indices.max() >= shape[0]:
+                raise UserError(f"{self.path}: {says} changes value {indices.max()} of {shape[0]}")
             rows = rows.copy()
-            rows[found] = self._rows(sparse.entry("values"), kind, (count, shape[1]), says)
+            rows[indices] = self._rows(sparse.entry("values"), kind, (count, shape[1]), says)
         self._values[index] = normalised(rows) if accessor.get("normalized", bool) else rows
         return self._values[index]
 
@@ -200,20 +200,20 @@ class GltfFile:
             nodes = self.document.entries("nodes")
             inner = {child for node in nodes for child in node.get("children", kind, [])}
             roots = [index for index in range(len(nodes)) if index not in inner]
-        own = self._own_nodes(roots)
-        found: list[tuple[Entry, int, np.ndarray]] = []
+        by_index = self._own_nodes(roots)
+        placed: list[tuple[Entry, int, np.ndarray]] = []
         left = [(root, _UNIT, 0) for root in reversed(roots)]
-        most = min(MAX_NODES, 8 * len(own))
+        most = min(MAX_NODES, 8 * len(by_index))
         while left:
             index, above, depth = left.pop()
             # A longer way has a node twice.
-            if len(found) + len(left) > most or depth > len(own):
+            if len(placed) + len(left) > most or depth > len(by_index):
                 raise UserError(f"{self.path}: nodes form a cycle, or are shared over {most} times")
-            node, children, matrix = own[index]
+            node, children, matrix = by_index[index]
             matrix = matrix if above is _UNIT else above @ matrix
-            found.append((node, index, matrix))
+            placed.append((node, index, matrix))
             left += [(child, matrix, depth + 1) for child in reversed(children)]
-        return found
+        return placed
 
     def _own_nodes(self, roots: list[int]) -> dict[int, tuple[Entry, list[int], np.ndarray]]:
         """Return each node under the roots with its children and its own matrix, by index."""
@@ -234,8 +234,8 @@ class GltfFile:
                 given = index not in matrices and node.values.get(name) is not None
                 moves[name].append(node.vector(name, default) if given else default)
         if nodes:
-            made = _matrices(*(np.array(moves[name], np.float64) for name in _IDENTITY))
-            matrices = dict(zip(nodes, made)) | matrices
+            composed = _matrices(*(np.array(moves[name], np.float64) for name in _IDENTITY))
+            matrices = dict(zip(nodes, composed)) | matrices
         return {index: (node, children[index], matrices[index]) for index, node in nodes.items()}
 
     def instances(self, node: Entry) -> np.ndarray:
@@ -243,17 +243,17 @@ class GltfFile:
 
         They come from ``EXT_mesh_gpu_instancing``; without it, one unit matrix.
         """
-        given = node.entry("extensions").entry(INSTANCING).entry("attributes")
-        if not given.values:
+        attributes = node.entry("extensions").entry(INSTANCING).entry("attributes")
+        if not attributes.values:
             return _UNIT[None]
         pose, counts = [], set()
         for name, default in _IDENTITY.items():
             rows = np.array([default])
-            if name.upper() in given.values:
-                rows = normalised(self.values(given.need(name.upper(), Index)))
+            if name.upper() in attributes.values:
+                rows = normalised(self.values(attributes.need(name.upper(), Index)))
                 counts.add(len(rows))
             if len(counts) > 1 or rows.shape[1] != len(default):
-                raise UserError(f"{given.where}: {len(rows)} x {rows.shape[1]} numbers {name}")
+                raise UserError(f"{attributes.where}: {len(rows)} x {rows.shape[1]} numbers {name}")
             pose.append(rows.astype(np.float64))
         count = counts.pop() if counts else 1
         self.count(16 * count)
@@ -320,14 +320,14 @@ def _chunks(path: Path, data: bytes, size: int) -> tuple[bytes, bytes]:
     if version != 2:
         raise UserError(f"{path}: cannot be read as a mesh (version {version} of .glb, not 2)")
     compare_sizes(path, "its header and chunks", length, size)
-    found: dict[bool, bytes] = {}
+    chunks: dict[bool, bytes] = {}
     at = 12
     while at + 8 <= size:
         chunk, name = struct.unpack_from("<I4s", data, at)
         compare_sizes(path, f"a chunk at byte {at}", chunk, size - at - 8, exact=False)
-        found.setdefault(name == b"JSON", data[at + 8 : at + 8 + chunk])
+        chunks.setdefault(name == b"JSON", data[at + 8 : at + 8 + chunk])
         at += 8 + chunk
-    if True not in found:
+    if True not in chunks:
         raise UserError(f"{path}: no JSON chunk")
     # Padded with blanks; some writers pad with zeros.
-    return found[True].rstrip(b"\0 "), found.get(False, b"")
+    return chunks[True].rstrip(b"\0 "), chunks.get(False, b"")

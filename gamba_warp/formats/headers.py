@@ -30,9 +30,9 @@ class Source(NamedTuple):
 
     def head(self, count: int) -> bytes:
         """Return the first bytes, and leave the file at its start."""
-        found = self.file.read(count)
+        head = self.file.read(count)
         self.file.seek(0)
-        return found
+        return head
 
     def check(self, limit: int = MAX_FILE) -> None:
         """Raise UserError if the file has more bytes than the limit."""
@@ -111,11 +111,11 @@ def parse_numbers(text: bytes, count: int, kind: Any = np.float64) -> np.ndarray
     if count == 0:
         return np.zeros(0, kind)
     try:
-        found = np.fromstring(text, kind, sep=" ")
+        numbers = np.fromstring(text, kind, sep=" ")
     except ValueError:
         return None
     # "1-2" is one word but two numbers; older releases of numpy stop at an invalid word.
-    return found if len(found) == count else None
+    return numbers if len(numbers) == count else None
 
 
 class Rows(NamedTuple):
@@ -124,12 +124,12 @@ class Rows(NamedTuple):
     values: np.ndarray  # [M] float64, of all rows one after the other
     sizes: np.ndarray  # [N] int64, how many each row has
 
-    def columns(self, *numbers: int) -> np.ndarray:
+    def columns(self, *indices: int) -> np.ndarray:
         """Return these numbers of each row, ``[N, C]`` float64; undefined for shorter rows."""
         width = int(self.sizes[0]) if len(self.sizes) else 0
-        if max(numbers) < width and (self.sizes == width).all():
-            return self.values.reshape(-1, width)[:, numbers]
-        at = (np.cumsum(self.sizes) - self.sizes)[:, None] + np.array(numbers, np.int64)
+        if max(indices) < width and (self.sizes == width).all():
+            return self.values.reshape(-1, width)[:, indices]
+        at = (np.cumsum(self.sizes) - self.sizes)[:, None] + np.array(indices, np.int64)
         return np.append(self.values, 0.0).take(at, mode="clip")
 
     def part(self, first: int, count: int) -> Rows:
@@ -180,18 +180,18 @@ def read_rows(text: bytes, source: str, comments: bool = False) -> Rows:
         UserError: a word is not a number, there are more than ``MAX_VALUES`` numbers, or as for
             ``blocks_of``.
     """
-    found = [Rows(np.zeros(0), np.zeros(0, np.int64))]
+    parsed = [Rows(np.zeros(0), np.zeros(0, np.int64))]
     left = MAX_VALUES
     for block in blocks_of(text.removeprefix(BOM), source):
         block = without_comments(block) if comments else block
         rows = parse_rows(block)
         if rows is None:
-            raise _no_number(block, source, sum(len(rows.sizes) for rows in found))
+            raise _no_number(block, source, sum(len(rows.sizes) for rows in parsed))
         left -= len(rows.values)
         if left < 0:
             raise UserError(f"{source}: over {MAX_VALUES} numbers, the limit for one file")
-        found.append(Rows(rows.values, rows.sizes[rows.sizes > 0]))
-    return joined_rows(found)
+        parsed.append(Rows(rows.values, rows.sizes[rows.sizes > 0]))
+    return joined_rows(parsed)
 
 
 def joined_rows(parts: list[Rows]) -> Rows:
@@ -203,7 +203,7 @@ def _no_number(block: bytes, source: str, before: int) -> UserError:
     """Return the error of the first word that is not a number, ``before`` rows from the start."""
     rows = (line.split() for line in block.split(b"\n") if not line.isspace() and line)
     words = ((word, row) for row, line in enumerate(rows, before + 1) for word in line)
-    word, row = next((found for found in words if not is_number(found[0])), (b"", before))
+    word, row = next((pair for pair in words if not is_number(pair[0])), (b"", before))
     shown = word[:60].decode("ascii", "replace")
     return UserError(f"{source}: could not convert '{shown}' of row {row} to a number")
 

@@ -76,8 +76,8 @@ class SideFiles:
         root = self.root or self.path.parent
         file = _find_file(self.path.parent, root, *names)
         if file is None:
-            there = os.path.normpath(self.path.parent / names[0].replace("\\", "/"))
-            outside = ".." in names[0] and root not in Path(there).parents
+            target = os.path.normpath(self.path.parent / names[0].replace("\\", "/"))
+            outside = ".." in names[0] and root not in Path(target).parents
             what = f"outside of {root}, not read" if outside else "not found"
             raise UserError(f"{_shown(names[0])}: {what}")
         data = read_bytes(file, min(MAX_SIDE_FILE, max(self.left, 0)))
@@ -94,8 +94,8 @@ class SideFiles:
     def image(self, name: str, profiled: bool = True) -> np.ndarray | None:
         """Return the image that an MTL file names, as ``texture`` does."""
         shown = _shown(name)
-        for option, numbers in _MOVING.findall(name[:2000]):
-            if not re.fullmatch(_AS_IT_IS[option], numbers):
+        for option, values in _MOVING.findall(name[:2000]):
+            if not re.fullmatch(_AS_IT_IS[option], values):
                 self.warnings.append(f"{shown}: the option -{option} is not read")
         try:
             return self.texture(self.read(name), shown, profiled)
@@ -153,14 +153,14 @@ def _find_file(folder: Path, root: Path, *names: str) -> Path | None:
             try:
                 base = folder
                 if ".." in relative:  # a sister of the mesh's folder
-                    there = Path(os.path.normpath(folder / relative))
-                    base, relative = root, there.relative_to(root).as_posix()
+                    target = Path(os.path.normpath(folder / relative))
+                    base, relative = root, target.relative_to(root).as_posix()
                 place = base
                 for part in inside(base, relative, "a mesh").relative_to(base).parts:
                     exact = place / part
                     if not exact.exists() and place.is_dir():
-                        same = [p for p in place.iterdir() if _folded(p.name) == _folded(part)]
-                        exact = same[0] if same else exact
+                        matches = [p for p in place.iterdir() if _folded(p.name) == _folded(part)]
+                        exact = matches[0] if matches else exact
                     place = exact
                 if place.is_file():
                     return inside(base, place.relative_to(base).as_posix(), "a mesh")

@@ -37,10 +37,10 @@ def read_off(source: Source, sides: SideFiles) -> Iterator[Part]:
         UserError: it holds less or more than its header states, or a word is not a number.
     """
     path, file, _ = source
-    found = _OFF.fullmatch(_next_line(file))
-    counts = (found[4] or _next_line(file)).split() if found else []
+    header = _OFF.fullmatch(_next_line(file))
+    counts = (header[4] or _next_line(file)).split() if header else []
     text = file.read()
-    if found is None or len(counts) < 2 or not all(w.isdecimal() for w in counts[:2]):
+    if header is None or len(counts) < 2 or not all(w.isdecimal() for w in counts[:2]):
         raise UserError(f"{path}: broken header, expected OFF and the vertex and face counts")
     count, faces = (int(word[:18]) for word in counts[:2])
     rows = read_rows(text, str(path), comments=True)
@@ -48,27 +48,27 @@ def read_off(source: Source, sides: SideFiles) -> Iterator[Part]:
     table = rows.part(0, count).table(f"{path}: vertices")
     if count and table.shape[1] < 3:
         raise UserError(f"{path}: row 1 has too few numbers")
-    numbers, sizes = rows.part(count, faces)
+    values, sizes = rows.part(count, faces)
     starts = np.cumsum(sizes) - sizes
-    lengths = numbers[starts]
+    lengths = values[starts]
     bad = ~((lengths >= 0) & (lengths < sizes) & (lengths == np.rint(lengths)))
     if bad.any():
         raise UserError(f"{path}: row {count + bad.argmax() + 1} has too few numbers")
     points, lengths = table[:, :3], lengths.astype(np.int64)
-    corners = numbers[spread(starts + 1, lengths)]
+    corners = values[spread(starts + 1, lengths)]
     places = cut_polygons(sides, points, corners, lengths)
     corners = corners.astype(np.int64)
-    of_vertices = table[:, 6 if found[3] else 3 : -2 if found[1] else None]
-    rest = sizes - 1 - lengths  # numbers behind a face's corners: a colour, or its index in a list
+    of_vertices = table[:, 6 if header[3] else 3 : -2 if header[1] else None]
+    extra = sizes - 1 - lengths  # numbers behind a face's corners: a colour, or its index in a list
     colors = None
     if of_vertices.shape[1] in (3, 4):
         colors = to_rgba8(of_vertices)[corners[places]]
-    elif (rest >= 3).any():
-        some, width = rest >= 3, 4 if (rest[rest >= 3] >= 4).all() else 3
+    elif (extra >= 3).any():
+        some, width = extra >= 3, 4 if (extra[extra >= 3] >= 4).all() else 3
         of_faces = np.full((faces, 4), 255, np.uint8)
-        of_faces[some] = to_rgba8(numbers[(starts + 1 + lengths)[some, None] + np.arange(width)])
+        of_faces[some] = to_rgba8(values[(starts + 1 + lengths)[some, None] + np.arange(width)])
         colors = of_faces[np.repeat(np.arange(faces), lengths)[places]]
-    elif of_vertices.shape[1] or rest.any():
+    elif of_vertices.shape[1] or extra.any():
         sides.warnings.append("colours that are not RGB are left out")
     yield Part(points, corners[places], colors=colors)
 
@@ -144,20 +144,20 @@ def ply_parts(data: PlyData, sides: SideFiles) -> Iterator[Part]:
     vertices, faces = data.elements.get("vertex", {}), data.elements.get("face", {})
     points = data.numbers("x", "y", "z")
     strips = {} if faces else data.elements.get("tristrips", {})
-    found = [(faces or strips).get(name) for name in _CORNERS]
-    lists = [x for x in found if isinstance(x, PlyList)]
+    columns = [(faces or strips).get(name) for name in _CORNERS]
+    lists = [x for x in columns if isinstance(x, PlyList)]
     if points is None or not lists:
         raise UserError(f"{path}: its vertices have no x, y and z, or its faces no indices")
     for name in data.elements:
         if name not in ("vertex", "tristrips" if strips else "face"):
             sides.omit(f"the element {name[:60]} is not read")
-    given, lengths = lists[0]
+    indices, lengths = lists[0]
     if strips:
-        given = np.insert(given.astype(np.int64), np.cumsum(lengths), -1)
-        given = strip_faces(given).reshape(-1)
-        lengths = np.full(len(given) // 3, 3)
-    places = cut_polygons(sides, points, given, lengths)
-    corners = given.astype(np.int64)[places]
+        indices = np.insert(indices.astype(np.int64), np.cumsum(lengths), -1)
+        indices = strip_faces(indices).reshape(-1)
+        lengths = np.full(len(indices) // 3, 3)
+    places = cut_polygons(sides, points, indices, lengths)
+    corners = indices.astype(np.int64)[places]
     normals, colors = data.numbers("nx", "ny", "nz"), _colors(vertices)
     if colors is not None:
         colors = colors[corners]
@@ -167,8 +167,8 @@ def ply_parts(data: PlyData, sides: SideFiles) -> Iterator[Part]:
     names = next((pair for pair in _UVS if {*pair} <= vertices.keys()), None)
     if isinstance(of_corners, PlyList) and (of_corners.lengths == 2 * lengths).all():
         uvs = of_corners.values.reshape(-1, 2)[places]
-    elif names is not None and (found := data.numbers(*names)) is not None:
-        uvs = found[corners]
+    elif names is not None and (vertex_uvs := data.numbers(*names)) is not None:
+        uvs = vertex_uvs[corners]
     material = None
     files = [m[1].strip() for m in map(_TEXTURE.match, data.header.comments) if m]
     if files:

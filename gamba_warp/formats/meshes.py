@@ -84,11 +84,11 @@ class TexturedMesh:
         flat = np.cross(second - first, third - first)
         length = np.linalg.norm(flat, axis=1, keepdims=True)
         flat = np.where(length > 0, flat / np.maximum(length, 1e-300), [0.0, 0.0, 1.0])
-        given = self.given_normals
-        if given is None:
+        given_normals = self.given_normals
+        if given_normals is None:
             smooth = _vertex_normals(self.vertices, self.faces)
         else:
-            smooth = np.nan_to_num(given)
+            smooth = np.nan_to_num(given_normals)
             lengths = np.linalg.norm(smooth, axis=2, keepdims=True)
             smooth = (smooth / np.maximum(lengths, 1e-12)).astype(np.float32)
         flat = flat.astype(np.float32)
@@ -154,27 +154,27 @@ def read_mesh(source: Source, sides: SideFiles) -> TexturedMesh:
     return mesh_of(_READERS[source.path.suffix.lower()](source, sides), sides)
 
 
-def mesh_of(found: Iterable[Part], sides: SideFiles) -> TexturedMesh:
+def mesh_of(parts: Iterable[Part], sides: SideFiles) -> TexturedMesh:
     """Join the parts of a file to one mesh; errors as for ``load_mesh``."""
-    parts: list[TexturedMesh] = []
+    meshes: list[TexturedMesh] = []
     count = 0
-    for part in found:
+    for part in parts:
         if not len(part.faces):
             continue
-        parts.append(_complete(part, sides))
-        count += len(part.faces) + len(parts[-1].vertices)  # a scene may repeat one part
+        meshes.append(_complete(part, sides))
+        count += len(part.faces) + len(meshes[-1].vertices)  # a scene may repeat one part
         if count > MAX_PARTS:
             limit = f"over {MAX_PARTS} vertices and faces, the limit for a mesh"
             raise UserError(f"{sides.path}: {limit}")
-    if not parts:
+    if not meshes:
         raise UserError(f"{sides.path}: no faces")
-    return _without_flat(_joined(parts, sides))
+    return _without_flat(_joined(meshes, sides))
 
 
 def _complete(part: Part, sides: SideFiles) -> TexturedMesh:
     """Return a part as a mesh. Raises UserError if a vertex is not finite."""
-    kept, faces = np.unique(part.faces, return_inverse=True)
-    faces, vertices = faces.reshape(-1, 3), part.vertices[kept]
+    used, faces = np.unique(part.faces, return_inverse=True)
+    faces, vertices = faces.reshape(-1, 3), part.vertices[used]
     if not np.isfinite(vertices).all():
         bad = len(vertices) - np.count_nonzero(np.isfinite(vertices).all(1))
         raise UserError(f"{sides.path}: {bad} of {len(vertices)} vertices are not finite")
@@ -212,7 +212,7 @@ def _joined(parts: list[TexturedMesh], sides: SideFiles) -> TexturedMesh:
     if extent <= 0:
         raise UserError(f"{sides.path}: all vertices coincide")
     materials = list({id(part.materials[0]): part.materials[0] for part in parts}.values())
-    numbers = {id(material): number for number, material in enumerate(materials)}
+    indices = {id(material): index for index, material in enumerate(materials)}
     if not any(map(_is_visible, parts)):
         sides.warnings.append("all its surfaces are transparent by their alpha: drawn opaque")
         colors[..., 3] = 255
@@ -228,7 +228,7 @@ def _joined(parts: list[TexturedMesh], sides: SideFiles) -> TexturedMesh:
                 part.given_normals = _vertex_normals(part.vertices, part.faces)
         normals = all_of("given_normals")
     for part in parts:
-        part.material_ids += numbers[id(part.materials[0])]
+        part.material_ids += indices[id(part.materials[0])]
         part.faces = part.faces + at if at else part.faces
         at += len(part.vertices)
     warnings, omitted = (list(dict.fromkeys(x)) for x in (sides.warnings, sides.omitted))
@@ -252,11 +252,11 @@ def _without_flat(mesh: TexturedMesh) -> TexturedMesh:
     if not solid.any():
         mesh.warnings.append("no face has an area")
         return mesh
-    kept, faces = np.unique(mesh.faces[solid], return_inverse=True)
+    used, faces = np.unique(mesh.faces[solid], return_inverse=True)
     normals = mesh.given_normals
     return replace(
         mesh,
-        vertices=mesh.vertices[kept],
+        vertices=mesh.vertices[used],
         faces=faces.reshape(-1, 3),
         uvs=mesh.uvs[solid],
         colors=mesh.colors[solid],

@@ -40,40 +40,40 @@ def read_obj(source: Source, sides: SideFiles) -> Iterator[Part]:
         text = _NO_NUMBER.sub(b"nan", text)
     if b"#MRGB" in text:
         sides.warnings.append("the colours of ZBrush (#MRGB) are not read")
-    found = _Statements(path, text)
+    statements = _Statements(path, text)
     del text
-    for word in sorted(found.unread - _IGNORED)[:9]:
+    for word in sorted(statements.unread - _IGNORED)[:9]:
         sides.omit(f"the statement {word} is not read")
-    vertices, uvs, normals = map(joined_rows, found.rows.values())
+    vertices, uvs, normals = map(joined_rows, statements.rows.values())
     points, colors = _vertices(vertices)
     # A texture may have one coordinate.
     vertex_uvs, vertex_normals = uvs.columns(0, 1), normals.columns(0, 1, 2)
     vertex_uvs[uvs.sizes < 2, 1] = 0.0
-    corners, lengths = np.concatenate(found.corners) - 1, np.concatenate(found.lengths)
+    corners, lengths = np.concatenate(statements.corners) - 1, np.concatenate(statements.lengths)
     places = cut_polygons(sides, points, corners[:, 0], lengths)
     beyond = corners >= [len(points), len(vertex_uvs), len(vertex_normals)]
     if beyond.any():
         sides.warnings.append("faces name texture coordinates or normals that are not there")
         corners[beyond] = -1
-    at, used = np.transpose(found.used)
-    group = used[np.searchsorted(at, np.concatenate(found.faces)) - 1]
+    at, used = np.transpose(statements.used)
+    group = used[np.searchsorted(at, np.concatenate(statements.faces)) - 1]
     if (lengths != 3).any():
         group = np.repeat(group, np.maximum(lengths - 2, 0))
-    numbers, first = np.unique(group, return_index=True)
-    if len(numbers) > MAX_MATERIALS:
-        raise UserError(f"{path}: uses {len(numbers)} materials, over the limit of {MAX_MATERIALS}")
-    names, library = [*found.names], _library(found.libraries[:MAX_LIBRARIES], sides)
+    ids, first = np.unique(group, return_index=True)
+    if len(ids) > MAX_MATERIALS:
+        raise UserError(f"{path}: uses {len(ids)} materials, over the limit of {MAX_MATERIALS}")
+    names, library = [*statements.names], _library(statements.libraries[:MAX_LIBRARIES], sides)
     order = np.argsort(group, kind="stable")
-    ends = np.searchsorted(group, numbers, "right", sorter=order)
+    ends = np.searchsorted(group, ids, "right", sorter=order)
     for i in np.argsort(first):
-        mine = places[order[ends[i - 1] if i else 0 : ends[i]]]
-        name = names[numbers[i]]
-        own = next((x for x in (name, _bare(name)) if x in library), None)
-        material = None if own is None else _material(library[own], own, sides)
-        part = Part(points, corners[mine, 0], material)
-        if len(vertex_normals) and (corners[mine, 2] >= 0).all():
-            part.normals = vertex_normals[corners[mine, 2]]
-        if len(vertex_uvs) and (at := corners[mine, 1]).max(initial=-1) >= 0:
+        triangles = places[order[ends[i - 1] if i else 0 : ends[i]]]
+        name = names[ids[i]]
+        key = next((x for x in (name, _bare(name)) if x in library), None)
+        material = None if key is None else _material(library[key], key, sides)
+        part = Part(points, corners[triangles, 0], material)
+        if len(vertex_normals) and (corners[triangles, 2] >= 0).all():
+            part.normals = vertex_normals[corners[triangles, 2]]
+        if len(vertex_uvs) and (at := corners[triangles, 1]).max(initial=-1) >= 0:
             part.uvs = np.where(at[..., None] >= 0, vertex_uvs[at], 0.0)
         if colors is not None and material is not None and material.texture is not None:
             sides.warnings.append("colours with a texture are not drawn")
@@ -181,8 +181,8 @@ def _corners(words: list[bytes]) -> np.ndarray | None:
     if not (inside | slash | (letters == ord(" "))).all() or b"///" in text:
         return None
     starts = np.flatnonzero(inside & ~np.append(False, inside[:-1]))
-    numbers = parse_numbers(text.replace(b"/", b" "), len(starts), np.int64)
-    if numbers is None or (np.abs(numbers) >= 10**_DIGITS).any():
+    indices = parse_numbers(text.replace(b"/", b" "), len(starts), np.int64)
+    if indices is None or (np.abs(indices) >= 10**_DIGITS).any():
         return None
     # Steps from one number to the next: a slash, two, or none before the first of a corner.
     steps = slash[starts - 1].astype(np.int8) + (slash[starts - 1] & slash[starts - 2])
@@ -194,7 +194,7 @@ def _corners(words: list[bytes]) -> np.ndarray | None:
     if (within > 2).any() or (places > 2).any():
         return None
     corners = np.zeros((len(heads), 3), np.int64)
-    corners[np.cumsum(steps == 0) - 1, places] = numbers
+    corners[np.cumsum(steps == 0) - 1, places] = indices
     return None if (corners[:, 0] == 0).any() else corners
 
 
@@ -220,19 +220,19 @@ def _bare(name: str) -> str:
 
 def _library(lines: list[str], sides: SideFiles) -> dict[str, dict[str, str]]:
     """Return the statements of each material of the MTL files, by their keywords in lower case."""
-    found: dict[str, dict[str, str]] = {}
+    library: dict[str, dict[str, str]] = {}
     for line in dict.fromkeys(lines):
         options: dict[str, str] = {}
         for text in _library_texts(line, sides):
             for row in text.decode("utf-8-sig", "replace").splitlines():
-                word, *rest = row.split(maxsplit=1) or [""]
+                word, *values = row.split(maxsplit=1) or [""]
                 if word.lower() == "newmtl":
-                    options, name = {}, " ".join(rest).strip()
-                    found[name] = options
-                    found.setdefault(_bare(name), options)
-                elif rest:
-                    options[word.lower()] = rest[0].strip()
-    return found
+                    options, name = {}, " ".join(values).strip()
+                    library[name] = options
+                    library.setdefault(_bare(name), options)
+                elif values:
+                    options[word.lower()] = values[0].strip()
+    return library
 
 
 def _library_texts(line: str, sides: SideFiles) -> list[bytes]:

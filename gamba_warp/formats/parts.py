@@ -89,10 +89,10 @@ def cut_polygons(
     first, lengths = first[lengths >= 3], lengths[lengths >= 3]
     counts = lengths - 2
     step = spread(np.zeros_like(counts), counts)[:, None]
-    found = np.repeat(first, counts)[:, None] + step + [0, 1, 2]
-    found[:, 0] -= step[:, 0]
+    triangles = np.repeat(first, counts)[:, None] + step + [0, 1, 2]
+    triangles[:, 0] -= step[:, 0]
     if not len(lengths) or lengths.max() == 3:
-        return found
+        return triangles
     # Of every corner the next one in its polygon, and the turn between their edges.
     at, begins = spread(first, lengths), np.cumsum(lengths) - lengths
     owner = np.repeat(np.arange(len(lengths)), lengths)
@@ -114,8 +114,8 @@ def cut_polygons(
         start, count = begins[index], lengths[index]
         ears = _ears(places[start : start + count], normals[index])
         if len(ears) == counts[index]:  # else the polygon intersects itself
-            found[ends[index] - counts[index] : ends[index]] = first[index] + ears
-    return found
+            triangles[ends[index] - counts[index] : ends[index]] = first[index] + ears
+    return triangles
 
 
 def _ears(places: np.ndarray, normal: np.ndarray) -> np.ndarray:

@@ -123,10 +123,10 @@ def ply_gaussians(path: Path, data: PlyData, left_out: list[str] | None = None) 
 
     ``left_out`` as for ``checked_gaussians``.
     """
-    given = data.elements.get("vertex", {}).keys()
-    packed = not given.isdisjoint(WORDS)
+    properties = data.elements.get("vertex", {}).keys()
+    packed = not properties.isdisjoint(WORDS)
     read = {*WORDS} if packed else {name for names in _GROUPS.values() for name in names}
-    unread = given - read - {*_WITHOUT_EFFECT}
+    unread = properties - read - {*_WITHOUT_EFFECT}
     names = ", ".join(sorted(name for name in unread if not _REST.fullmatch(name)))
     if any(_TIME.fullmatch(name) for name in unread):
         advice = "write those of one moment as a .ply of 3DGS"

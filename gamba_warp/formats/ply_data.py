@@ -94,10 +94,10 @@ class PlyData(NamedTuple):
 
     def numbers(self, *names: str) -> np.ndarray | None:
         """Return properties of the vertices, ``[N, C]`` float64; None if one is missing."""
-        found = [self.elements.get("vertex", {}).get(name) for name in names]
-        if not all(isinstance(column, np.ndarray) for column in found):
+        columns = [self.elements.get("vertex", {}).get(name) for name in names]
+        if not all(isinstance(column, np.ndarray) for column in columns):
             return None
-        return np.stack([np.asarray(column, np.float64) for column in found], 1)
+        return np.stack([np.asarray(column, np.float64) for column in columns], 1)
 
 
 def _read_header(path: Path, file: BinaryIO) -> PlyHeader:
@@ -159,16 +159,16 @@ def parse_ply(source: Source) -> PlyData:
     file.seek(header.start)
     says = ", ".join(f"{element.count} {element.name}" for element in header.elements)
     if header.format == "ascii":
-        text, first, found = file.read(), 0, {}
+        text, first, columns = file.read(), 0, {}
         text = text if b"\n" in text else text.replace(b"\r", b"\n")
         rows = read_rows(text, str(path))
         for element in header.elements:
             count = element.count if element.properties else 0
-            found[element.name] = _from_text(path, rows.part(first, count), element)
+            columns[element.name] = _from_text(path, rows.part(first, count), element)
             first += count
         if first < len(rows.sizes):
             raise UserError(f"{path}: invalid header, more lines follow than {says}")
-        return PlyData(header, found)
+        return PlyData(header, columns)
     least = sum(element.least_bytes() for element in header.elements)
     compare_sizes(path, says, least, size - header.start, exact=False)
     data, at = file.read(), 0
@@ -210,14 +210,14 @@ def _from_text(path: Path, rows: Rows, element: PlyElement) -> Columns:
     if not any(item.length for item in items):
         table = rows.table(source, (len(items),))
         return {item.name: _typed(path, table[:, i], item) for i, item in enumerate(items)}
-    numbers, sizes = rows
+    values, sizes = rows
     spans, ends = [], np.cumsum(sizes)
     at = ends - sizes
     for item in items:
         lengths = np.ones(count, np.int64)
         if item.length:
-            stated = np.where(at < ends, numbers.take(at, mode="clip"), 0)
-            bad = ~((stated >= 0) & (stated <= len(numbers)) & (stated == np.rint(stated)))
+            stated = np.where(at < ends, values.take(at, mode="clip"), 0)
+            bad = ~((stated >= 0) & (stated <= len(values)) & (stated == np.rint(stated)))
             if bad.any():
                 raise UserError(f"{source} has a list of length {stated[bad][0]:g}")
             lengths, at = stated.astype(np.int64), at + 1
@@ -228,7 +228,7 @@ def _from_text(path: Path, rows: Rows, element: PlyElement) -> Columns:
         wanted = sizes[row] + at[row] - ends[row]
         raise UserError(f"{source} has a row of {sizes[row]} numbers, not {wanted}")
     return {
-        item.name: _column(item, _typed(path, numbers[spread(start, lengths)], item), lengths)
+        item.name: _column(item, _typed(path, values[spread(start, lengths)], item), lengths)
         for item, (start, lengths) in zip(items, spans)
     }
 

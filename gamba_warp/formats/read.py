@@ -197,11 +197,11 @@ def read_gaussians(path: str | Path, left_out: list[str] | None = None) -> Gauss
     Raises:
         UserError: as for ``read``, or the file contains no Gaussians.
     """
-    found = read(path, left_out is not None, Gaussians)
+    file = read(path, left_out is not None, Gaussians)
     if left_out is not None:
-        left_out += found.warnings
-    assert isinstance(found.shape, Gaussians)
-    return found.shape
+        left_out += file.warnings
+    assert isinstance(file.shape, Gaussians)
+    return file.shape
 
 
 def find_gaussians(inputs: Sequence[Path]) -> tuple[list[Path], list[tuple[Path, str]]]:

@@ -102,14 +102,14 @@ def checked_gaussians(
             array = np.ascontiguousarray(array, np.float32)
         values[name] = torch.from_numpy(array if array.flags.writeable else array.copy())
         finite[name] = values[name].reshape(count, -1).isfinite().all(1)
-    odd = " or ".join(name for name, which in finite.items() if not which.all())
+    odd = " or ".join(name for name, mask in finite.items() if not mask.all())
     checks = {f"{odd} that are not finite": ~torch.stack([*finite.values()]).all(0)}
     for name in ("means", "scales"):
         far = (values[name].abs() > MAX_REACH) & values[name].isfinite()
         checks[f"{name} over {MAX_REACH:g}"] = far.any(1)
     checks["scales below 0"] = (values["scales"] < 0).any(1)
     checks["rotations of length zero"] = (values["quats"] == 0).all(1)
-    bad = {reason: which for reason, which in checks.items() if which.any()}
+    bad = {reason: mask for reason, mask in checks.items() if mask.any()}
     if bad:
         keep = ~torch.stack([*bad.values()]).any(0)
         kept = int(keep.sum())
@@ -122,8 +122,8 @@ def checked_gaussians(
     values["quats"] = _unit(values["quats"])
     values["opacities"] = values["opacities"].clamp(0, 1)
     warn_of_steps(path, values["means"], step)
-    given: dict[str, Any] = {**values}
-    return Gaussians(**given)
+    fields: dict[str, Any] = {**values}
+    return Gaussians(**fields)
 
 
 def warn_of_steps(path: str | Path, means: torch.Tensor, step: float = 0.0) -> None:

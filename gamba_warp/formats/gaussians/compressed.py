@@ -95,8 +95,8 @@ def unpacked(path: Path, data: PlyData) -> dict[str, np.ndarray]:
     with np.errstate(over="ignore"):
         scales = np.exp(logs)
     rest = np.zeros((count, 0))
-    if found := data.elements.get("sh", {}):
-        rest = _table(path, data, "sh", rest_names(len(found)), np.uint8)
+    if columns := data.elements.get("sh", {}):
+        rest = _table(path, data, "sh", rest_names(len(columns)), np.uint8)
     if len(rest) != count:
         raise UserError(f"{path}: invalid header, {count} vertices but {len(rest)} harmonics")
     # The middle of each step, but the ends are the ends.
@@ -115,12 +115,12 @@ def _table(
     path: Path, data: PlyData, element: str, names: tuple[str, ...], kind: type
 ) -> np.ndarray:
     """Return ``[N, C]``. Raises UserError if a property is missing or of another type."""
-    found = data.elements.get(element, {})
+    columns = data.elements.get(element, {})
     for name in names:
-        column = found.get(name)
+        column = columns.get(name)
         if not isinstance(column, np.ndarray) or column.dtype.newbyteorder("=") != kind:
             raise UserError(f"{path}: {element} has no property {name} of {np.dtype(kind).name}")
-    return np.stack([np.asarray(found[name]).astype(kind) for name in names], 1)
+    return np.stack([np.asarray(columns[name]).astype(kind) for name in names], 1)
 
 
 def _between(

@@ -31,14 +31,14 @@ def to_be_written(gaussians: Gaussians, least: float | None = None) -> tuple[Gau
     Raises:
         UserError: none is left.
     """
-    kept = gaussians.drawn(least)
+    drawn = gaussians.drawn(least)
     limit = "1/255" if least is None else f"{least:g}"
-    if kept.num == 0:
+    if drawn.num == 0:
         raise UserError(f"no Gaussian has an opacity of {limit} or more")
-    lost = gaussians.num - kept.num
+    lost = gaussians.num - drawn.num
     why = f"opacity under {limit}" + (", never drawn" if least is None else "")
     said = f", {lost:,} left out ({why})" if lost and (least or STAGES.verbose) else ""
-    return kept, f"{kept.num:,} Gaussians{said}."
+    return drawn, f"{drawn.num:,} Gaussians{said}."
 
 
 def write_gaussians(

@@ -47,8 +47,8 @@ def gltf_gaussians(file: GltfFile, left_out: list[str] | None = None) -> Gaussia
     path, parts = file.path, []
     for node, _, matrix in file.placed_nodes():
         index = node.get("mesh", Index)
-        found = [] if index is None else _splats(file.item("meshes", index))
-        for primitive in found:
+        primitives = [] if index is None else _splats(file.item("meshes", index))
+        for primitive in primitives:
             part = _primitive(file, primitive, left_out)
             poses = matrix @ file.instances(node)
             parts += [_moved(path, part, pose, left_out) for pose in poses]
@@ -60,7 +60,7 @@ def gltf_gaussians(file: GltfFile, left_out: list[str] | None = None) -> Gaussia
 def _primitive(file: GltfFile, primitive: Entry, left_out: list[str] | None) -> Gaussians:
     """Return the Gaussians of one primitive in its own frame."""
     path, options = file.path, primitive.entry("extensions").entry(EXTENSION).values
-    mode, given = primitive.get("mode", int, 4), primitive.entry("attributes")
+    mode, attributes = primitive.get("mode", int, 4), primitive.entry("attributes")
     if options.get("extensions"):
         names = ", ".join(str(name)[:60] for name in options["extensions"])
         raise UserError(f"{path}: its Gaussians' compression {names[:200]} is not supported")
@@ -72,9 +72,9 @@ def _primitive(file: GltfFile, primitive: Entry, left_out: list[str] | None) -> 
         )
 
     def read(name: str, width: int) -> np.ndarray:
-        if name not in given.values:
+        if name not in attributes.values:
             raise UserError(f"{path}: the Gaussians have no {name}")
-        index = given.need(name, Index)
+        index = attributes.need(name, Index)
         values = file.values(index)
         accessor = file.item("accessors", index).values
         if values.shape[1] != width or "bufferView" not in accessor:
@@ -82,7 +82,7 @@ def _primitive(file: GltfFile, primitive: Entry, left_out: list[str] | None) -> 
         return values.astype(np.float64)
 
     degree = 0
-    while f"{EXTENSION}:SH_DEGREE_{degree + 1}_COEF_0" in given.values:
+    while f"{EXTENSION}:SH_DEGREE_{degree + 1}_COEF_0" in attributes.values:
         degree += 1
     if degree > 3:
         raise UserError(f"{path}: harmonics of degree {degree}, only 0 to 3 are supported")
@@ -138,7 +138,7 @@ def _joined(parts: list[Gaussians]) -> Gaussians:
         return parts[0]
     most = max(0 if part.harmonics is None else part.harmonics.shape[1] for part in parts)
     for part in parts if most else ():
-        own = torch.zeros(part.num, 0, 3) if part.harmonics is None else part.harmonics
-        part.harmonics = F.pad(own, (0, 0, 0, most - own.shape[1]))
+        harmonics = torch.zeros(part.num, 0, 3) if part.harmonics is None else part.harmonics
+        part.harmonics = F.pad(harmonics, (0, 0, 0, most - harmonics.shape[1]))
     joined = {name: torch.cat([getattr(p, name) for p in parts]) for name in parts[0].tensors()}
     return replace(parts[0], **joined)

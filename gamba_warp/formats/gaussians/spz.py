@@ -135,31 +135,31 @@ def read_spz(source: Source, left_out: list[str] | None = None) -> Gaussians:
     """
     path = source.path
     content = source.file.read()
-    found = (_from_streams if content.startswith(MAGIC) else _from_gzip)(path, content)
+    unpacked = (_from_streams if content.startswith(MAGIC) else _from_gzip)(path, content)
     start, columns = 0, []
-    for size in found.widths:
-        rows = np.frombuffer(found.body, np.uint8, found.count * size, start)
-        columns.append(rows.reshape(found.count, size))
+    for size in unpacked.widths:
+        rows = np.frombuffer(unpacked.body, np.uint8, unpacked.count * size, start)
+        columns.append(rows.reshape(unpacked.count, size))
         start += rows.nbytes
-    parts = [_activated(found, [x[rows] for x in columns]) for rows in _chunks(found.count)]
+    parts = [_activated(unpacked, [x[rows] for x in columns]) for rows in _chunks(unpacked.count)]
     names = parts[0] if parts else ("opacities",)
     arrays = {name: np.concatenate([part[name] for part in parts] or [[]]) for name in names}
-    del found.body, columns, parts
-    step = 2.0**-found.bits if found.version > 1 else 0.0
+    del unpacked.body, columns, parts
+    step = 2.0**-unpacked.bits if unpacked.version > 1 else 0.0
     gaussians = checked_gaussians(path, arrays, left_out, step)
-    return flip_axes(replace(gaussians, antialiased=found.antialiased))
+    return flip_axes(replace(gaussians, antialiased=unpacked.antialiased))
 
 
-def _activated(found: _Unpacked, columns: list[np.ndarray]) -> dict[str, np.ndarray]:
+def _activated(unpacked: _Unpacked, columns: list[np.ndarray]) -> dict[str, np.ndarray]:
     """Return the activated values, float32, of rows of bytes ``[n, size]`` of each kind."""
     positions, opacities, colors, logs, turns, *harmonics = columns
-    if found.version == 1:
+    if unpacked.version == 1:
         means = np.ascontiguousarray(positions).view("<f2")
     else:
         low = positions.reshape(-1, 3, 3).astype(np.int32)
         fixed = low[..., 0] | low[..., 1] << 8 | low[..., 2] << 16
-        means = (fixed - ((fixed & 0x800000) << 1)) / 2.0**found.bits
-    if found.version > 2:
+        means = (fixed - ((fixed & 0x800000) << 1)) / 2.0**unpacked.bits
+    if unpacked.version > 2:
         quats = _unpacked_quats(np.ascontiguousarray(turns).view("<u4")[:, 0])
     else:
         xyz = turns / 127.5 - 1
@@ -171,8 +171,8 @@ def _activated(found: _Unpacked, columns: list[np.ndarray]) -> dict[str, np.ndar
         "opacities": opacities[:, 0] / 255,
         "colors": (colors / 255 - 0.5) / _COLOR * SH_C0 + 0.5,
     }
-    for rest in harmonics:  # empty at degree 0
-        arrays["harmonics"] = (rest.reshape(len(rest), -1, 3).astype(np.float64) - 128) / 128
+    for sh in harmonics:  # empty at degree 0
+        arrays["harmonics"] = (sh.reshape(len(sh), -1, 3).astype(np.float64) - 128) / 128
     return {name: value.astype(np.float32) for name, value in arrays.items()}
 
 
@@ -223,10 +223,10 @@ def _header(path: Path, header: bytes, packed: int) -> _Unpacked:
     if bits > _MAX_BITS or count > MAX_POINTS:
         raise UserError(f"{path}: broken header, {count} Gaussians, {bits} bits")
     position, rotation = 6 if version == 1 else 9, 4 if version > 2 else 3
-    each = [position, 1, 3, 3, rotation, *([3 * counts[degree]] if degree else [])]
+    widths = [position, 1, 3, 3, rotation, *([3 * counts[degree]] if degree else [])]
     says = f"{count} Gaussians"
-    compare_sizes(path, says, count * sum(each), _MAX_RATIO * packed, exact=False)
-    return _Unpacked(b"", version, count, bits, bool(flags & ANTIALIASED), each)
+    compare_sizes(path, says, count * sum(widths), _MAX_RATIO * packed, exact=False)
+    return _Unpacked(b"", version, count, bits, bool(flags & ANTIALIASED), widths)
 
 
 def _from_gzip(path: Path, content: bytes) -> _Unpacked:
@@ -238,8 +238,8 @@ def _from_gzip(path: Path, content: bytes) -> _Unpacked:
         _, version, count, _, _, flags, _ = HEADER.unpack(head)
         if version not in (1, 2, 3):
             raise UserError(f"{path}: .spz of version {version}, in gzip only 1 to 3 are supported")
-        found = _header(path, head, len(content))
-        wanted = count * sum(found.widths)
+        unpacked = _header(path, head, len(content))
+        wanted = count * sum(unpacked.widths)
         body = stream.read(wanted + 1)
         records = body[wanted:]
         if flags & _MORE and records:
@@ -250,8 +250,8 @@ def _from_gzip(path: Path, content: bytes) -> _Unpacked:
     if records and not flags & _MORE:
         raise UserError(f"{path}: invalid header, more data follows than {count} Gaussians need")
     _check_axes(path, records)
-    found.body = body[:wanted]
-    return found
+    unpacked.body = body[:wanted]
+    return unpacked
 
 
 def _from_streams(path: Path, content: bytes) -> _Unpacked:
@@ -262,8 +262,8 @@ def _from_streams(path: Path, content: bytes) -> _Unpacked:
     (table,) = _PLAIN.unpack_from(content, HEADER.size)
     if version != 4:
         raise UserError(f"{path}: .spz of version {version}, without gzip only 4 is supported")
-    found = _header(path, content[: HEADER.size], len(content))
-    sizes = [found.count * width for width in found.widths]
+    unpacked = _header(path, content[: HEADER.size], len(content))
+    sizes = [unpacked.count * width for width in unpacked.widths]
     if streams != len(sizes) or table < start:
         raise UserError(f"{path}: broken header, {streams} streams, their table at byte {table}")
     at = table + streams * _ENTRY.size
@@ -283,8 +283,8 @@ def _from_streams(path: Path, content: bytes) -> _Unpacked:
     for number, (size, length) in enumerate(zip(sizes, packed)):
         body += _stream(path, zstd, number, view[at : at + length], size)
         at += length
-    found.body = body
-    return found
+    unpacked.body = body
+    return unpacked
 
 
 def _stream(path: Path, zstd: Any, number: int, packed: memoryview, size: int) -> bytes:
@@ -293,18 +293,18 @@ def _stream(path: Path, zstd: Any, number: int, packed: memoryview, size: int) -
     window = {zstd.DecompressionParameter.window_log_max: max(_WINDOW, size.bit_length())}
     decoder = zstd.ZstdDecompressor(options=window)
     try:
-        found = decoder.decompress(packed, size + 1)
+        data = decoder.decompress(packed, size + 1)
     except zstd.ZstdError as error:
         reason = first_line(error)
         raise UserError(f"{path}: stream {number} is truncated or damaged ({reason})") from error
-    if len(found) > size or decoder.unused_data:
+    if len(data) > size or decoder.unused_data:
         raise UserError(f"{path}: invalid header, stream {number} holds more than {size} bytes")
-    if not decoder.eof or len(found) < size:
+    if not decoder.eof or len(data) < size:
         raise UserError(
-            f"{path}: truncated or invalid header, stream {number} ends after {len(found)} of"
+            f"{path}: truncated or invalid header, stream {number} ends after {len(data)} of"
             f" {size} bytes"
         )
-    return found
+    return data
 
 
 def _zstd(path: Path) -> Any:
