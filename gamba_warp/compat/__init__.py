@@ -56,10 +56,10 @@ def take_names(*packages: str) -> None:
         if name in EXTENSIONS:
             sys.modules[name] = extension(name)
             continue
-        own = importlib.import_module(f"{_HERE}.{name}")
+        ours = importlib.import_module(f"{_HERE}.{name}")
         theirs = importlib.util.find_spec(name) if name == "gsplat" else None
-        folders = getattr(own, "__path__", ())  # none of a single module
-        for _, path, _ in pkgutil.walk_packages(folders, f"{own.__name__}."):
+        folders = getattr(ours, "__path__", ())  # none of a single module
+        for _, path, _ in pkgutil.walk_packages(folders, f"{ours.__name__}."):
             if not path.endswith("gsplat.strategy"):  # it is gsplat's own and loads gsplat
                 importlib.import_module(path)
         for path, module in list(sys.modules.items()):
@@ -67,19 +67,19 @@ def take_names(*packages: str) -> None:
             if under.partition(".")[0] == name and (theirs is None or under in _OF_GSPLAT):
                 sys.modules[under] = module
         if theirs is not None:
-            sys.modules[name] = _overlay(own, name, theirs.submodule_search_locations)
+            sys.modules[name] = _overlay(ours, name, theirs.submodule_search_locations)
     if not any(isinstance(finder, _Versions) for finder in sys.meta_path):
         sys.meta_path.append(_Versions())
 
 
-def _overlay(own: ModuleType, name: str, folders: Any) -> ModuleType:
+def _overlay(ours: ModuleType, name: str, folders: Any) -> ModuleType:
     """Make a package with our names that finds its other modules in the given folders."""
-    made = type(own)(name, own.__doc__)
-    kept = {"__name__", "__package__", "__loader__", "__spec__"}
-    vars(made).update({key: value for key, value in vars(own).items() if key not in kept})
-    made.__path__ = list(folders)
-    made.__spec__ = importlib.util.spec_from_loader(name, None, is_package=True)
-    return made
+    package = type(ours)(name, ours.__doc__)
+    identity = {"__name__", "__package__", "__loader__", "__spec__"}
+    vars(package).update({key: value for key, value in vars(ours).items() if key not in identity})
+    package.__path__ = list(folders)
+    package.__spec__ = importlib.util.spec_from_loader(name, None, is_package=True)
+    return package
 
 
 class _Versions(importlib.metadata.DistributionFinder):

@@ -80,7 +80,7 @@ def _in_try(frame: FrameType) -> bool:
 
 
 def complete(
-    package: str, original: str, why: str, names: dict[str, str], found: tuple[str, ...] = ()
+    package: str, original: str, why: str, names: dict[str, str], dynamic: tuple[str, ...] = ()
 ) -> dict[str, list[str]]:
     """Add the version, and placeholders for the names and modules that a package lacks.
 
@@ -93,20 +93,20 @@ def complete(
         why: the end of the line.
         names: by module of the original, relative to it, names separated by blanks. Missing modules
             are made; they take names that the package has from it.
-        found: names of the package's ``__getattr__``.
+        dynamic: names of the package's ``__getattr__``.
 
     Returns:
         The missing names by module.
     """
     root = sys.modules[package]
     vars(root)["__version__"] = VERSIONS[package.rpartition(".")[2]]
-    own = {*vars(root), *found}
+    defined = {*vars(root), *dynamic}
     missing = {}
     for path, text in names.items():
         module, listed = _module(f"{package}.{path}".rstrip(".")), set(text.split())
-        if listed & own:
-            vars(module)["__getattr__"] = _of_root(root, listed & own)
-        missing[path] = sorted(listed - own - {*vars(module)})
+        if listed & defined:
+            vars(module)["__getattr__"] = _of_root(root, listed & defined)
+        missing[path] = sorted(listed - defined - {*vars(module)})
         lines = {name: f"{original}'s {name} is not here: {why}" for name in missing[path]}
         vars(module)["_absent"] = {x: _absent(x, module, line) for x, line in lines.items()}
         module.__class__ = _Module
@@ -136,6 +136,6 @@ def _module(name: str) -> ModuleType:
     if name not in sys.modules:
         above = _module(parent)
         if importlib.util.find_spec(name) is None:
-            made = importlib.util.module_from_spec(ModuleSpec(name, None, is_package=True))
-            sys.modules[name] = vars(above)[last] = made
+            module = importlib.util.module_from_spec(ModuleSpec(name, None, is_package=True))
+            sys.modules[name] = vars(above)[last] = module
     return importlib.import_module(name)

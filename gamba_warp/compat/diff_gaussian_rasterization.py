@@ -295,8 +295,8 @@ def rasterize_gaussians(
     bins = bin_op(*(s.detach() for s in splats), width, height, ALPHA_MIN, SKIP)
     size = Size(width, height, 1, channels.dim() == 3, SKIP)
     drawn = centers, projected.conics, shown, channels
-    given = list(bins), None, absolute, *size, *LIMITS
-    renders, transmittances, *_ = composite(*drawn, *given)
+    arguments = list(bins), None, absolute, *size, *LIMITS
+    renders, transmittances, *_ = composite(*drawn, *arguments)
     layers = renders[0].permute(2, 0, 1)
     clear = transmittances[0].permute(2, 0, 1)
     bg = settings.bg.detach().to(layers)[:, None, None]
@@ -328,8 +328,8 @@ def _project(
     scales = x.get("scales")
     if scales is not None and settings.scale_modifier != 1:
         # As in the original, the gradient ignores the modifier.
-        own = scales.detach()
-        scales = own * settings.scale_modifier + (scales - own)
+        detached = scales.detach()
+        scales = detached * settings.scale_modifier + (scales - detached)
     options = ProjectionOptions(
         settings.image_width, settings.image_height, NEAR, float("inf"), 0.0, EPS2D, ALPHA_MIN,
         bool(settings.antialiasing), skip_unused=True, original=True,
@@ -359,12 +359,12 @@ def _checked(
     **optional: Tensor | None,
 ) -> dict[str, Tensor]:
     """Check the arguments by name, before any launch; return the given ones in float32."""
-    given: dict[str, Any] = dict(means3D=means3D, means2D=means2D, opacities=opacities)
+    tensors: dict[str, Any] = dict(means3D=means3D, means2D=means2D, opacities=opacities)
     empty = isinstance(means3D, Tensor) and len(means3D) == 0
     for name, x in optional.items():
         if x is not None and (empty or not isinstance(x, Tensor) or x.numel()):
-            given[name] = x
-    names = {*given}
+            tensors[name] = x
+    names = {*tensors}
     if len(names & {"shs", "colors_precomp"}) != 1:
         raise ValueError("shs, colors_precomp: exactly one of them must be given")
     if names & {"scales", "rotations", "cov3D_precomp"} not in (
@@ -372,8 +372,8 @@ def _checked(
     ):  # fmt: skip
         raise ValueError("scales and rotations, or cov3D_precomp: one of them must be given")
     one_of("sh_degree", settings.sh_degree, *range(_MAX_SH_DEGREE + 1))
-    check_tensor("means3D", given["means3D"], ("N", 3), dtypes=DTYPES)
-    num = len(given["means3D"])
+    check_tensor("means3D", tensors["means3D"], ("N", 3), dtypes=DTYPES)
+    num = len(tensors["means3D"])
     shapes = {
         "means2D": ((num, 3),), "opacities": ((num, 1), (num,)),
         "shs": ((num, f"K >= {(settings.sh_degree + 1) ** 2}", 3),),
@@ -382,15 +382,15 @@ def _checked(
         "means2D_densify": ((num, 3),),
     }  # fmt: skip
     for name, allowed in shapes.items():
-        if name in given:
-            check_tensor(name, given[name], *allowed, dtypes=DTYPES)
-    channels = given["colors_precomp"].shape[1] if "colors_precomp" in given else 3
+        if name in tensors:
+            check_tensor(name, tensors[name], *allowed, dtypes=DTYPES)
+    channels = tensors["colors_precomp"].shape[1] if "colors_precomp" in tensors else 3
     check_tensor("bg", settings.bg, (channels,))
     check_tensor("campos", settings.campos, (3,))
     check_tensor("viewmatrix", settings.viewmatrix, (4, 4))
     check_tensor("projmatrix", settings.projmatrix, (4, 4))
-    one_device(given)
-    return {name: value.float().contiguous() for name, value in given.items()}
+    one_device(tensors)
+    return {name: value.float().contiguous() for name, value in tensors.items()}
 
 
 def _camera(settings: GaussianRasterizationSettings, device: torch.device) -> tuple[Tensor, Tensor]:

@@ -62,13 +62,13 @@ def flex_bwd(u, delta, A, B, C, D, delta_bias, dout, x, delta_softplus, nrows=1)
     return scan_bwd(u, delta, A, B, C, D, None, delta_bias, *more)
 
 
-def _gradients(function, given, *douts) -> tuple[Any, list[Any]]:
+def _gradients(function, tensors, *douts) -> tuple[Any, list[Any]]:
     """Run a function, and return its result and the gradients of the given tensors or None."""
-    leaves = [None if t is None else t.detach().requires_grad_() for t in given]
+    leaves = [None if t is None else t.detach().requires_grad_() for t in tensors]
     with torch.enable_grad():
         outs = function(*leaves)
-    found = iter(torch.autograd.grad(outs, [t for t in leaves if t is not None], douts))
-    return outs, [None if t is None else next(found) for t in leaves]
+    grads = iter(torch.autograd.grad(outs, [t for t in leaves if t is not None], douts))
+    return outs, [None if t is None else next(grads) for t in leaves]
 
 
 @torch.no_grad()
@@ -97,8 +97,8 @@ def conv_bwd(x, weight, bias, dout, *rest) -> list[Any]:
     """
     *rest, silu = rest
     early = len(rest) <= 2
-    *given, dx = rest if early else rest[:4]
-    seq_idx, initial, dfinal = (*given, None, None, None)[:3]
+    *between, dx = rest if early else rest[:4]
+    seq_idx, initial, dfinal = (*between, None, None, None)[:3]
 
     def run(x, weight, bias, initial):
         states = initial, dfinal is not None, None, "silu" if silu else None
@@ -134,6 +134,6 @@ EXTENSIONS: dict[str, dict[str, Any]] = {
 
 def extension(name: str) -> ModuleType:
     """Return the module of that name."""
-    made = importlib.util.module_from_spec(ModuleSpec(name, None))
-    vars(made).update(EXTENSIONS[name])
-    return made
+    module = importlib.util.module_from_spec(ModuleSpec(name, None))
+    vars(module).update(EXTENSIONS[name])
+    return module

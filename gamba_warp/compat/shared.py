@@ -110,9 +110,9 @@ def with_order(function: Callable[..., Any], names: str, **fixed: Any) -> Callab
         names: of the parameters in their order; others cannot be given.
         fixed: values of other parameters.
     """
-    own = signature(function).parameters
+    parameters = signature(function).parameters
     kind = Parameter.POSITIONAL_OR_KEYWORD
-    order = Signature([own[name].replace(kind=kind) for name in names.split()])
+    order = Signature([parameters[name].replace(kind=kind) for name in names.split()])
 
     def call(*args: Any, **options: Any) -> Any:
         return function(**order.bind(*args, **options).arguments, **fixed)
@@ -132,7 +132,7 @@ def of_rows(update: Callable[[Tensor], Tensor], state: Tensor, indices: Tensor |
     """
     if indices is None:
         return update(state)
-    rows, kept = state.index_select(0, indices.clamp(min=0)), indices >= 0
+    rows, valid = state.index_select(0, indices.clamp(min=0)), indices >= 0
     out = update(rows)
-    state.index_copy_(0, indices[kept].long(), rows[kept])
-    return out.masked_fill(~kept.view(-1, *[1] * (out.dim() - 1)), 0)
+    state.index_copy_(0, indices[valid].long(), rows[valid])
+    return out.masked_fill(~valid.view(-1, *[1] * (out.dim() - 1)), 0)

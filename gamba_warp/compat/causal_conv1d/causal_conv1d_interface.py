@@ -56,8 +56,8 @@ def causal_conv1d_update(
     check_tensor("bias", bias, (channels,), dtypes=DTYPES, optional=True)
     rows, least = batch if conv_state_indices is None else "rows", max(1, weight.shape[1] - 1)
     check_tensor("conv_state", conv_state, (rows, channels, f"S >= {least}"), dtypes=DTYPES)
-    numbers = {"cache_seqlens": cache_seqlens, "conv_state_indices": conv_state_indices}
-    for name, value in numbers.items():
+    indices = {"cache_seqlens": cache_seqlens, "conv_state_indices": conv_state_indices}
+    for name, value in indices.items():
         check_tensor(name, value, (batch,), dtypes=INDEX_DTYPES, optional=True)
 
     def update(state: Tensor) -> Tensor:

@@ -157,8 +157,8 @@ def blend(
         sums = torch.zeros_like(means2d)
         means2d = means2d.view_as(means2d)  # it has no other gradient than the compositor's
         means2d.register_hook(lambda _: keep(sums.flatten(0, 1).clone()))
-    given = list(bins), None, sums, *size, *LIMITS
-    renders, transmittances, *_ = composite(means2d, *layers[1:], *given)
+    arguments = list(bins), None, sums, *size, *LIMITS
+    renders, transmittances, *_ = composite(means2d, *layers[1:], *arguments)
     return renders, transmittances
 
 
@@ -272,13 +272,13 @@ def rasterize_to_pixels(
         count=starts[-1],
     )
     tiling = Tiling(grid_x * parts * TILE, grid_y * parts * TILE)
-    found = []
+    cropped = []
     for image in blend(layers, bins, tiling, keep=keep if absgrad else None):
         apart = image.unflatten(2, (grid_x, -1)).unflatten(1, (grid_y, -1))
         whole = apart[:, :, :tile_size, :, :tile_size].flatten(3, 4).flatten(1, 2)
         whole = whole[:, :image_height, :image_width]
-        found.append(whole.reshape(*lead, *whole.shape[1:]))
-    renders, transmittances = found
+        cropped.append(whole.reshape(*lead, *whole.shape[1:]))
+    renders, transmittances = cropped
     if backgrounds is not None:
         renders = renders + transmittances * backgrounds.expand(shape)[..., None, None, :]
     return renders, 1 - transmittances

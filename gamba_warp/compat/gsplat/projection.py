@@ -205,8 +205,8 @@ def project_views(scene: dict[str, Tensor], colors: Tensor, options: ProjectionO
         shown = torch.where(finite, opacities[:, None], 0.0)
         whole: Any = covars[..., [0, 1, 2, 1, 3, 4, 2, 4, 5]].unflatten(-1, (3, 3))
         return _project_covariances(means, whole, shown, viewmats, Ks, options)
-    given = means, quats, scales, covars, opacities, colors.detach(), viewmats, Ks
-    splats = Splats(*project(*given, *options)[:5])
+    arguments = means, quats, scales, covars, opacities, colors.detach(), viewmats, Ks
+    splats = Splats(*project(*arguments, *options)[:5])
     splats = splats._replace(extents=splats.extents.detach())
     if not options.antialiased or quats is None or scales is None:
         return splats
@@ -218,8 +218,8 @@ def project_views(scene: dict[str, Tensor], colors: Tensor, options: ProjectionO
         return splats
     wide = quats[b, g].double(), scales[b, g].double()
     whole = quat_scale_to_covar_preci(*wide, True, False)[0]
-    given = means[b, g], whole, opacities[b, g, None], viewmats[b, c], Ks[b, c]
-    exact = _project_covariances(*(x[:, None] for x in given), options=options)
+    arguments = means[b, g], whole, opacities[b, g, None], viewmats[b, c], Ks[b, c]
+    exact = _project_covariances(*(x[:, None] for x in arguments), options=options)
     return Splats(*(x.index_put(at, one[:, 0, 0]) for x, one in zip(splats, exact)))
 
 
@@ -264,14 +264,14 @@ def _project_covariances(
         seen = seen & inside.all(-1) & (reach > options.radius_clip).any(-1)
     conics = torch.stack([yy / det, -xy / yy, 1 / yy], -1)
     box, blank = seen[..., None], conics.new_tensor([1.0, 0.0, 1.0])
-    kept = (
+    fields = (
         torch.where(box, centers, 0.0),
         torch.where(box, conics, blank),
         torch.where(seen, turned[..., 2], 0.0),
         torch.where(seen, shown, 0.0),
         torch.where(box, extents, 0.0),
     )
-    return Splats(*(x.float().contiguous() for x in kept))
+    return Splats(*(x.float().contiguous() for x in fields))
 
 
 def fully_fused_projection(
@@ -318,11 +318,11 @@ def fully_fused_projection(
     tensors: dict[str, Any] = dict(means=means, viewmats=viewmats, Ks=Ks)
     tensors |= dict(quats=quats, scales=scales) if covars is None else dict(covars=covars)
     lead = check_scene({**tensors, **({} if opacities is None else {"opacities": opacities})}, (6,))
-    given = {name: flat(x, lead) for name, x in tensors.items()}
+    flattened = {name: flat(x, lead) for name, x in tensors.items()}
     opacity = flat(means.detach()[..., 0] if opacities is None else opacities.detach(), lead)
 
     def projected(opacity: Tensor, antialiased: bool) -> Splats:
-        scene = {**given, "opacities": opacity}
+        scene = {**flattened, "opacities": opacity}
         options = ProjectionOptions(
             width, height, near_plane, far_plane, radius_clip, eps2d, ALPHA_MIN, antialiased,
             skip_unused=True, rounded=True,
@@ -331,17 +331,17 @@ def fully_fused_projection(
 
     compensations = None
     if opacities is not None:
-        found = projected(opacity, calc_compensations)
+        splats = projected(opacity, calc_compensations)
         if calc_compensations:
             # An opacity of 0 is culled, and its factor is 0.
-            compensations = found.opacities / opacity[:, None].clamp_min(ALPHA_MIN)
+            compensations = splats.opacities / opacity[:, None].clamp_min(ALPHA_MIN)
     else:
-        found = projected(torch.full_like(opacity, _OPAQUE), False)
+        splats = projected(torch.full_like(opacity, _OPAQUE), False)
         if calc_compensations:  # without opacities the factor does not shrink gsplat's boxes
             factors = projected(torch.full_like(opacity, _LARGE), True).opacities / _LARGE
-            compensations = torch.where((found.extents > 0).all(-1), factors, 0.0)
-    radii = found.extents.ceil().int()
-    results = radii, found.means2d, found.depths, plain_conics(found.conics), compensations
+            compensations = torch.where((splats.extents > 0).all(-1), factors, 0.0)
+    radii = splats.extents.ceil().int()
+    results = radii, splats.means2d, splats.depths, plain_conics(splats.conics), compensations
     if not packed:
         return tuple(None if x is None else x.view(*lead, *x.shape[1:]) for x in results)
     at = (radii > 0).all(-1).nonzero(as_tuple=True)

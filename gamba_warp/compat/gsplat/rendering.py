@@ -100,9 +100,9 @@ def rasterization(
         TypeError: an argument is not a tensor.
         ValueError: a shape, device or option is not allowed; the message names it.
     """
-    given = locals()
+    arguments = locals()
     for name in MUST_BE_DEFAULT:
-        one_of(name, given[name], _PARAMETERS[name].default)
+        one_of(name, arguments[name], _PARAMETERS[name].default)
     one_of("rolling_shutter", getattr(rolling_shutter, "name", rolling_shutter), "GLOBAL")
     one_of("render_mode", render_mode, "RGB", "D", "ED", "RGB+D", "RGB+ED")
     one_of("rasterize_mode", rasterize_mode, "classic", "antialiased")
@@ -125,20 +125,20 @@ def rasterization(
 
     if covars is not None:  # as in gsplat, the upper entries count
         tensors["covars"] = covars[..., [0, 0, 0, 1, 1, 2], [0, 1, 2, 1, 2, 2]]
-    given = {name: flat(x, lead) for name, x in tensors.items()}
+    scene = {name: flat(x, lead) for name, x in tensors.items()}
     if colors is None or not colored:
-        blended = torch.ones_like(given["opacities"])[..., None]
+        blended = torch.ones_like(scene["opacities"])[..., None]
     elif sh_degree is None:
         blended = flat(colors, lead)
     else:
-        centers = torch.linalg.inv(given["viewmats"])[..., :3, 3]
+        centers = torch.linalg.inv(scene["viewmats"])[..., :3, 3]
         colors = flat(colors, lead)
-        blended = colors_seen_from(sh_degree, colors, given["means"], centers).contiguous()
+        blended = colors_seen_from(sh_degree, colors, scene["means"], centers).contiguous()
     options = ProjectionOptions(
         width, height, near_plane, far_plane, radius_clip, eps2d, ALPHA_MIN,
         rasterize_mode == "antialiased", skip_unused=True, rounded=True,
     )  # fmt: skip
-    splats = project_views(given, blended, options)
+    splats = project_views(scene, blended, options)
     radii = splats.extents.ceil().int()
     seen = (radii > 0).all(-1)
     at = seen.nonzero(as_tuple=True) if packed else None

@@ -29,8 +29,8 @@ def selective_scan_ref(
     B, C = (input_matrix(x, u, name).float() for x, name in ((B, "B"), (C, "C")))
     D, delta_bias = (None if x is None else x.float() for x in (D, delta_bias))
     z = None if z is None else z.mT.float()
-    given = u.mT.float(), delta.mT.float(), A.float(), B, C, D, z, delta_bias
-    out, last = selective_scan_reference(*given, delta_softplus=delta_softplus)
+    arguments = u.mT.float(), delta.mT.float(), A.float(), B, C, D, z, delta_bias
+    out, last = selective_scan_reference(*arguments, delta_softplus=delta_softplus)
     out = out.mT.to(u.dtype)
     return (out, last) if return_last_state else out
 
@@ -120,8 +120,8 @@ def mamba_inner_fn(
     weights = conv1d_weight, conv1d_bias, x_proj_weight, delta_proj_weight
     rest = B_proj_bias, C_proj_bias, delta_softplus, checkpoint_lvl
     norms = b_rms_weight, c_rms_weight, dt_rms_weight, b_c_dt_rms_eps
-    given = xz, *weights, A, B, C, D, delta_bias, *rest, *norms
-    y = mamba_inner_fn_no_out_proj(*given, A_b=A_b)
+    arguments = xz, *weights, A, B, C, D, delta_bias, *rest, *norms
+    y = mamba_inner_fn_no_out_proj(*arguments, A_b=A_b)
     return F.linear(y.transpose(1, 2), out_proj_weight, out_proj_bias)
 
 
@@ -131,9 +131,9 @@ def bimamba_inner_fn(
     A_b: Tensor, *args: Any, **options: Any,
 ) -> Tensor:  # fmt: skip
     """Add a scan from the last token to the first, with ``A_b``, to ``mamba_inner_fn``."""
-    given = xz, conv1d_weight, conv1d_bias, x_proj_weight, delta_proj_weight
+    arguments = xz, conv1d_weight, conv1d_bias, x_proj_weight, delta_proj_weight
     of_output = out_proj_weight, out_proj_bias
-    return mamba_inner_fn(*given, *of_output, A, *args, A_b=A_b, **options)
+    return mamba_inner_fn(*arguments, *of_output, A, *args, A_b=A_b, **options)
 
 
 # mamba-ssm's references run on its two kernels as well. To check the kernels, compare
