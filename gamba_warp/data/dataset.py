@@ -246,8 +246,8 @@ def content_digest(files: ObjectFiles) -> str:
     """Return 16 hexadecimal digits of an object's cameras and kinds of images."""
     kinds = f"{len(files.images)} {files.depths is None} {files.backs is None}"
     digest = hashlib.sha256(kinds.encode())
-    for numbers in (files.camera_to_world, files.Ks):
-        digest.update(numbers.tobytes())
+    for matrices in (files.camera_to_world, files.Ks):
+        digest.update(matrices.tobytes())
     return digest.hexdigest()[:16]
 
 
@@ -258,8 +258,8 @@ def _check_images(files: ObjectFiles) -> None:
     parents = Counter(path.parent for path in paths)
     plain: dict[Path, set[str]] = {}
     for parent in (parent for parent, number in parents.items() if number > 2):
-        with suppress(OSError), os.scandir(parent) as found:
-            plain[parent] = {entry.name for entry in found if not entry.is_symlink()}
+        with suppress(OSError), os.scandir(parent) as entries:
+            plain[parent] = {entry.name for entry in entries if not entry.is_symlink()}
     for path in paths:
         if path.name not in plain.get(path.parent, ()) and not os.path.exists(path):  # never raises
             raise UserError(f"{path}: no such file")
@@ -491,8 +491,8 @@ class ViewDataset:
     ) -> tuple[np.ndarray, np.ndarray]:
         """Load RGBA ``[H, W, 4]`` uint8 and K ``[3, 3]`` of one view at the requested size."""
         path, stated = files.images[view], files.sizes[view]
-        found = self._images.get((path, size)) if self._images is not None else None
-        if found is None:
+        loaded = self._images.get((path, size)) if self._images is not None else None
+        if loaded is None:
             image = _read_rgba8(path)
             height, width = image.shape[:2]
             if stated not in (None, (width, height)):
@@ -507,10 +507,10 @@ class ViewDataset:
                 # background bleeds in.
                 kind = Image.Resampling.BOX if size < height else Image.Resampling.BILINEAR
                 image = np.asarray(Image.fromarray(image).resize(new, kind))
-            found = image, (width, height)
+            loaded = image, (width, height)
             if self._images is not None:
-                self._images[path, size] = found
-        image, original = found
+                self._images[path, size] = loaded
+        image, original = loaded
         from_size = (1.0, 1.0) if stated is None else original
         factor = [image.shape[1] / from_size[0], image.shape[0] / from_size[1], 1.0]
         return image, files.Ks[view] * np.array(factor)[:, None]
@@ -561,11 +561,11 @@ def camera_note(dataset: ViewDataset) -> str | None:
     Checks up to eight objects, skipping unreadable ones. The warning names a convention by which
     the cameras would face it.
     """
-    found = []
+    per_object = []
     for uid in evenly(dataset.uids, 8):
         with suppress(*EXPECTED):
-            found.append(dataset.files(uid).camera_to_world)
-    poses = np.concatenate([np.zeros((0, 4, 4)), *found])
+            per_object.append(dataset.files(uid).camera_to_world)
+    poses = np.concatenate([np.zeros((0, 4, 4)), *per_object])
     facing = _facing(poses)
     if not len(poses) or facing >= 0.5:
         return None

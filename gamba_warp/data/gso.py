@@ -88,7 +88,7 @@ def protocol_of(there: Iterable[str], names: Sequence[str] = NAMES) -> dict[str,
     Returns:
         The size, the poses, the missing objects of the list, and the evaluated ones outside it.
     """
-    found = set(there)
+    evaluated = set(there)
     return {
         "name": "gso",
         "size": SIZE,
@@ -97,7 +97,7 @@ def protocol_of(there: Iterable[str], names: Sequence[str] = NAMES) -> dict[str,
         "list": "the 60 of the protocol" if names == NAMES else "given by --objects",
         "list_sha256": hashlib.sha256("\n".join(names).encode()).hexdigest(),
         "objects": len(names),
-        "evaluated": len(found & set(names)),
-        "missing": [name for name in names if name not in found],
-        "others": sorted(found - set(names)),
+        "evaluated": len(evaluated & set(names)),
+        "missing": [name for name in names if name not in evaluated],
+        "others": sorted(evaluated - set(names)),
     }

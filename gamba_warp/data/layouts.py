@@ -409,8 +409,8 @@ def _with_suffix(image: Path | MemoryImage) -> Path | MemoryImage:
         return image
     if os.path.lexists(image):
         return image
-    found = [image.with_name(image.name + suffix) for suffix in IMAGES]
-    return next((p for p in found if p.exists()), found[1])
+    candidates = [image.with_name(image.name + suffix) for suffix in IMAGES]
+    return next((p for p in candidates if p.exists()), candidates[1])
 
 
 def _read_frames(names: tuple[str, ...], folder: Path) -> ObjectFiles:
@@ -436,11 +436,11 @@ def object_of(documents: Sequence[tuple[Path | str, object, Find]]) -> ObjectFil
     top: dict = {}
     for path, content, find in documents:
         common, frames = _frames(path, content)
-        top, found = top or common, _images(path, frames, find)
-        first = found["file_path"][0]
+        top, paths = top or common, _images(path, frames, find)
+        first = paths["file_path"][0]
         parts.append(_cameras(path, common, frames, cache(partial(_size_of, first))))
         for key in _PATHS:
-            files[key] += found[key]
+            files[key] += paths[key]
     path, count = documents[0][0], len(files["file_path"])
     _check_count(count, path)
     depth_unit = _number({"depth_unit": 1e-3, **top}, "depth_unit", str(path))
@@ -450,7 +450,7 @@ def object_of(documents: Sequence[tuple[Path | str, object, Find]]) -> ObjectFil
     if not isinstance(attribution, dict):
         attribution = {"text": attribution}
     images, *others = files.values()
-    masks, depths, backs = (found if len(found) == count else None for found in others)
+    masks, depths, backs = (paths if len(paths) == count else None for paths in others)
     if files["mask_path"] and masks is None:
         raise UserError(f"{path}: {len(files['mask_path'])} of {count} frames have a mask")
     return ObjectFiles(
@@ -500,11 +500,11 @@ class _View(Struct):
 
 
 def _read_gobjaverse(folder: Path) -> ObjectFiles:
-    found = sorted(p for p in (folder / GOBJAVERSE).iterdir() if p.is_dir())
-    _check_count(len(found), folder)
+    folders = sorted(p for p in (folder / GOBJAVERSE).iterdir() if p.is_dir())
+    _check_count(len(folders), folder)
     # A broken link counts as present, and raises when it is read.
-    both = [[view / f"{view.name}{suffix}" for suffix in (".json", ".png")] for view in found]
-    views = [view for view, files in zip(found, both) if all(map(os.path.lexists, files))]
+    both = [[view / f"{view.name}{suffix}" for suffix in (".json", ".png")] for view in folders]
+    views = [view for view, files in zip(folders, both) if all(map(os.path.lexists, files))]
     if not views:
         raise UserError(f"{folder / GOBJAVERSE}: no views with both image and camera")
     aspect = 0.0  # of the first image, opened only if needed
@@ -576,14 +576,14 @@ def find_objects(root: Path) -> tuple[str, list[Path], list[Path]]:
         UserError: the folders are nested too deep.
     """
     marks, layout = {mark: name for name, (mark, _) in LAYOUTS.items()}, ""
-    found, others = [], []
+    objects, others = [], []
     for folder, subfolders, files in walk(root):
         if folder.count(os.sep) > str(root).count(os.sep) + _MAX_DEPTH:
             raise UserError(f"{root}: its folders are nested deeper than {_MAX_DEPTH}")
         if mark := next((m for m in marks if m in files or m in subfolders), None):
             subfolders.clear()  # objects are not nested
             marks, layout = {mark: marks[mark]}, marks[mark]
-            found.append(Path(folder))
+            objects.append(Path(folder))
         else:
             others.append(Path(folder))
-    return layout, sorted(found), others
+    return layout, sorted(objects), others

@@ -93,8 +93,8 @@ def list_of(folder: str) -> str:
         OSError: it cannot be read.
     """
     marks = {mark for mark, _ in LAYOUTS.values()}
-    with os.scandir(folder) as found:
-        names = [e.name for e in found if e.name in marks or (e.name[0] != "." and e.is_dir())]
+    with os.scandir(folder) as entries:
+        names = [e.name for e in entries if e.name in marks or (e.name[0] != "." and e.is_dir())]
     return hashlib.sha256(os.fsencode("\n".join(sorted(names)))).hexdigest()[:16]
 
 
@@ -104,15 +104,15 @@ def marks_of(folder: Path, names: Iterable[str]) -> list[_Mark]:
     Raises:
         UserError: none of them exists.
     """
-    found: list[_Mark] = []
+    marks: list[_Mark] = []
     for name in dict.fromkeys(names):
         try:
-            found.append((name, *_mark(os.path.join(folder, name))))
+            marks.append((name, *_mark(os.path.join(folder, name))))
         except OSError:  # of an object that cannot be read
             continue
-    if not found:
+    if not marks:
         raise UserError(f"{folder}: removed while it was read")
-    return found[:_MARKS]
+    return marks[:_MARKS]
 
 
 def _mark(path: str) -> tuple[int, int]:
@@ -178,7 +178,7 @@ def _read(root: Path, *status: int) -> Manifest:
                 same = False
             if not same:
                 raise older(name)
-        made, base = Manifest(head.layout, {}, {}), os.fspath(root)
+        manifest, base = Manifest(head.layout, {}, {}), os.fspath(root)
         for number in range(2, head.objects + 2):
             source = f"{path}: line {number}"
             line = file.readline(_MAX_LINE)
@@ -186,7 +186,7 @@ def _read(root: Path, *status: int) -> Manifest:
                 raise UserError(f"{path}: cut short at line {number}; {again}")
             entry = parse_document(line, Entry, source)
             uid = "/".join(_parts(entry.uid, source))
-            if uid in made.digests:
+            if uid in manifest.digests:
                 raise UserError(f"{source}: the object {uid} occurs twice")
             for name, *wanted in entry.marks:
                 if name != ".":
@@ -197,12 +197,12 @@ def _read(root: Path, *status: int) -> Manifest:
                     same = False
                 if not same:
                     raise older(uid)
-            made.digests[uid] = entry.digest
+            manifest.digests[uid] = entry.digest
             if entry.reason:
-                made.bad[uid] = one_line(entry.reason)
+                manifest.bad[uid] = one_line(entry.reason)
         if file.read(1):
             raise UserError(f"{path}: has more than {head.objects} objects; {again}")
-    return made
+    return manifest
 
 
 def _parts(name: str, source: str) -> tuple[str, ...]:
