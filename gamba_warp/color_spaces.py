@@ -127,7 +127,7 @@ def conversion(image: Image.Image, warn: Callable[[str], None]) -> Convert | Non
 
 def _code_points(image: Image.Image) -> tuple[int, int, bool] | None:
     """Return primaries and transfer function by number, and whether the range is full."""
-    file, found = cast(Any, image).fp, None
+    file, code_points = cast(Any, image).fp, None
     if image.format == "PNG":
         start = file.tell()
         file.seek(8)
@@ -135,21 +135,21 @@ def _code_points(image: Image.Image) -> tuple[int, int, bool] | None:
             length = struct.unpack(">I", head[:4])[0]
             if head[4:] == b"cICP" and length == 4:
                 primaries, transfer, _, full = file.read(4)
-                found = primaries, transfer, bool(full)
+                code_points = primaries, transfer, bool(full)
                 break
             file.seek(length + 4, io.SEEK_CUR)
         file.seek(start)
     elif image.format == "AVIF" and "icc_profile" not in image.info:
         start = file.tell()
         file.seek(0)
-        _, box, numbers = file.read(_META).partition(b"colrnclx")
+        _, box, nclx = file.read(_META).partition(b"colrnclx")
         file.seek(start)
-        if box and len(numbers) >= 4:
-            primaries, transfer = struct.unpack(">2H", numbers[:4])
-            found = primaries, transfer, True  # the decoder widens the range
-    elif numbers := image.info.get("nclx_profile"):
-        found = int(numbers["color_primaries"]), int(numbers["transfer_characteristics"]), True
-    return found
+        if box and len(nclx) >= 4:
+            primaries, transfer = struct.unpack(">2H", nclx[:4])
+            code_points = primaries, transfer, True  # the decoder widens the range
+    elif nclx := image.info.get("nclx_profile"):
+        code_points = int(nclx["color_primaries"]), int(nclx["transfer_characteristics"]), True
+    return code_points
 
 
 def _stated_space(image: Image.Image) -> Space:
@@ -203,9 +203,9 @@ def _from_profile(profile: bytes, mode: str) -> Convert | None:
     transform = ImageCms.buildTransform(source, srgb, source_mode, "RGB", flags=flags)
 
     def colours(band: Image.Image) -> Image.Image:
-        made = ImageCms.applyTransform(band.convert(source_mode), transform)
-        assert made is not None  # because it is not in place
-        return made
+        converted = ImageCms.applyTransform(band.convert(source_mode), transform)
+        assert converted is not None  # because it is not in place
+        return converted
 
     levels = np.arange(256, dtype=np.uint8)
     if mode == "L":  # grey stays grey, as masks must
@@ -224,9 +224,9 @@ def _keeping_alpha(colours: Convert) -> Convert:
     """Extend a conversion to images with alpha, which is copied."""
 
     def convert(band: Image.Image) -> Image.Image:
-        made = colours(band)
+        converted = colours(band)
         if "A" in band.mode:
-            made.putalpha(band.getchannel("A"))
-        return made
+            converted.putalpha(band.getchannel("A"))
+        return converted
 
     return convert

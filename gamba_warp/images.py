@@ -116,16 +116,16 @@ def check_size(width: int, height: int, name: object, max_pixels: int = MAX_PIXE
 
 def _check_file(path: str | Path, name: object) -> None:
     try:
-        found = os.stat(path)
+        status = os.stat(path)
     except FileNotFoundError as error:
         raise UserError(f"{name}: no such file") from error
     except (OSError, ValueError) as error:  # ValueError: a NUL in the name
         raise UserError(f"{name}: {getattr(error, 'strerror', None) or error}") from error
-    if stat.S_ISDIR(found.st_mode):
+    if stat.S_ISDIR(status.st_mode):
         raise UserError(f"{name}: is a folder, not an image")
-    if not stat.S_ISREG(found.st_mode):
+    if not stat.S_ISREG(status.st_mode):
         raise UserError(f"{name}: not a plain file")
-    if found.st_size == 0:
+    if status.st_size == 0:
         raise UserError(f"{name}: the file is empty")
 
 
@@ -413,8 +413,8 @@ def find_images(
         inside = sorted(p for p in files if p.suffix.lower() in IMAGE_SUFFIXES)
         paths.update(dict.fromkeys(inside))
         if not inside:
-            more = left_out(path, recursive)
-            failures.append((path, "the folder holds no images" + (f" ({more})" if more else "")))
+            note = left_out(path, recursive)
+            failures.append((path, "the folder holds no images" + (f" ({note})" if note else "")))
     return list(paths), failures
 
 
@@ -428,16 +428,16 @@ def left_out(path: Path, recursive: bool = False) -> str:
     if folders and not recursive:
         counts.append(f"{len(folders)} folder{'s' * (len(folders) > 1)}")
         hint = "; --recursive takes the folders"
-    said = ", ".join(filter(None, counts))
-    return f"{said} skipped{hint}" if said else ""
+    skipped = ", ".join(filter(None, counts))
+    return f"{skipped} skipped{hint}" if skipped else ""
 
 
 def _inside(path: Path, recursive: bool) -> tuple[list[Path], list[Path]]:
     """Return the files and folders of a folder without hidden ones. Raises OSError."""
     files, folders = [], []
-    for found in sorted(path.iterdir()):
-        if not found.name.startswith("."):
-            (folders if found.is_dir() else files).append(found)
+    for child in sorted(path.iterdir()):
+        if not child.name.startswith("."):
+            (folders if child.is_dir() else files).append(child)
     for folder in folders if recursive else ():
         if not folder.is_symlink():
             files += _inside(folder, True)[0]
