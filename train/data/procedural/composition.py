@@ -98,8 +98,8 @@ def turned(m: Maker, radius: float, height: float, fine: int) -> Manifold:
         end = profile[-1]
         cap = np.stack([end[0] * np.cos(angle), end[1] + end[0] * m.u(0.2, 1) * np.sin(angle)], 1)
         profile = np.concatenate([profile, np.maximum(cap, [0.005, -1])])
-    made = lathe(profile, m.pick(6, 8, fine, fine, fine))
-    return made.translate([0, -height / 2, 0])
+    solid = lathe(profile, m.pick(6, 8, fine, fine, fine))
+    return solid.translate([0, -height / 2, 0])
 
 
 def outline(m: Maker, sides: int) -> np.ndarray:
@@ -239,8 +239,8 @@ def hollowed(m: Maker, solid: Manifold, look: int) -> Manifold:
             [*center[[0]], float(level + 1.5 * size[1]), *center[[2]]]
         )
         inner = inner + m.stamp(above, look)
-    made = solid - inner
-    return made if made.volume() > 0.05 * solid.volume() else solid
+    hollow = solid - inner
+    return hollow if hollow.volume() > 0.05 * solid.volume() else solid
 
 
 def cut(m: Maker, solid: Manifold, mirrored: bool, look: int) -> Manifold:
@@ -255,5 +255,5 @@ def cut(m: Maker, solid: Manifold, mirrored: bool, look: int) -> Manifold:
     height = size * m.u(0.05, 1.5)
     tool = m.pick(lathe([(r, 0), (r, height)], 24), box(r * m.u(0.5, 3), height / 2, r), ball(r))
     tool = m.stamp(turned_to(tool, -normal, point + 0.02 * size * normal), look)
-    made = solid - (both(tool) if mirrored else tool)
-    return made if made.volume() > 0.3 * solid.volume() else solid
+    remainder = solid - (both(tool) if mirrored else tool)
+    return remainder if remainder.volume() > 0.3 * solid.volume() else solid

@@ -145,29 +145,29 @@ class Maker:
 
 def finished(solids: Sequence[Manifold], looks: Sequence[Look]) -> TexturedMesh | None:
     """Union of stamped solids as a textured mesh; None if it is empty or a sheet."""
-    whole = joined([s for s in solids if not s.is_empty()])
-    if whole.is_empty():
+    union = joined([s for s in solids if not s.is_empty()])
+    if union.is_empty():
         return None
-    low, high = extent(whole)
+    low, high = extent(union)
     size = float((high - low).max())
-    if not np.isfinite(size) or whole.volume() < THINNEST * size**3:
+    if not np.isfinite(size) or union.volume() < THINNEST * size**3:
         return None
     tolerance = 1e-4 * size
-    while whole.num_tri() > MAX_FACES:
-        whole = whole.simplify(tolerance)
+    while union.num_tri() > MAX_FACES:
+        union = union.simplify(tolerance)
         tolerance *= 2
-    mesh = whole.calculate_normals(0, SHARP).to_mesh()
+    mesh = union.calculate_normals(0, SHARP).to_mesh()
     points = np.asarray(mesh.vert_properties)
     corners = np.asarray(mesh.tri_verts).astype(np.int64)
     number = np.repeat(np.asarray(mesh.run_original_id), np.diff(mesh.run_index) // 3).astype(
         np.int64
     )
-    same = np.arange(len(points))
-    same[np.asarray(mesh.merge_from_vert, np.int64)] = np.asarray(mesh.merge_to_vert, np.int64)
-    used, faces = np.unique(same[corners], return_inverse=True)
+    merged = np.arange(len(points))
+    merged[np.asarray(mesh.merge_from_vert, np.int64)] = np.asarray(mesh.merge_to_vert, np.int64)
+    used, faces = np.unique(merged[corners], return_inverse=True)
     vertices = points[used, :3].astype(np.float64)
     faces = faces.reshape(-1, 3)
-    normals = _normals(points[:, 3:6], same, corners, vertices[faces])
+    normals = _normals(points[:, 3:6], merged, corners, vertices[faces])
     uvs, ids, materials = _mapped(points[corners, 6:9], number, looks)
     return TexturedMesh(
         vertices=vertices,
@@ -181,7 +181,7 @@ def finished(solids: Sequence[Manifold], looks: Sequence[Look]) -> TexturedMesh 
 
 
 def _normals(
-    rough: np.ndarray, same: np.ndarray, corners: np.ndarray, places: np.ndarray
+    rough: np.ndarray, merged: np.ndarray, corners: np.ndarray, places: np.ndarray
 ) -> np.ndarray:
     """Unit normals ``[F, 3, 3]`` of corners: area-weighted means over the faces of a smooth patch.
 
@@ -189,12 +189,12 @@ def _normals(
 
     Args:
         rough: ``[V, 3]`` normals, equal if a vertex's faces belong to one patch.
-        same: ``[V]`` the first of the vertices at one position.
+        merged: ``[V]`` the first of the vertices at one position.
         corners: ``[F, 3]`` vertices of faces.
         places: ``[F, 3, 3]`` positions of the corners.
     """
     steps = np.rint(500 * rough).astype(np.int64) + 512
-    key = ((same * 1024 + steps[:, 0]) * 1024 + steps[:, 1]) * 1024 + steps[:, 2]
+    key = ((merged * 1024 + steps[:, 0]) * 1024 + steps[:, 1]) * 1024 + steps[:, 2]
     groups, group = np.unique(key, return_inverse=True)
     group = group[corners]
     across = np.cross(places[:, 1] - places[:, 0], places[:, 2] - places[:, 0])
@@ -230,14 +230,14 @@ def _mapped(
     ids = np.zeros(len(skin), np.int64)
     materials: list[Material] = []
     for index in np.unique(number):
-        look, mine = looks[index], np.flatnonzero(number == index)
-        ids[mine] = len(materials)
+        look, faces = looks[index], np.flatnonzero(number == index)
+        ids[faces] = len(materials)
         materials.append(look.material)
-        sign = signs[mine][:, None]
+        sign = signs[faces][:, None]
         if look.repeats:
-            uvs[mine] = uv[mine] * sign * look.repeats
+            uvs[faces] = uv[faces] * sign * look.repeats
             continue
-        size, sides = np.maximum(look.high - look.low, 1e-6), _ACROSS[axis[mine]]
-        fraction = (uv[mine] - look.low[sides][:, None]) / size[sides][:, None]
-        uvs[mine] = np.where(sign > 0, fraction, 1 - fraction)
+        size, sides = np.maximum(look.high - look.low, 1e-6), _ACROSS[axis[faces]]
+        fraction = (uv[faces] - look.low[sides][:, None]) / size[sides][:, None]
+        uvs[faces] = np.where(sign > 0, fraction, 1 - fraction)
     return uvs, ids, materials

@@ -37,9 +37,9 @@ def make_object(rng: np.random.Generator) -> TexturedMesh:
         if rng.random() < TURNED:
             angle = float(rng.uniform(0, 360))
             parts = [part.rotate([0, angle, 0]) for part in parts]
-        made = finished(parts, maker.looks)
-        if made is not None:  # else it is empty or hardly more than a sheet
-            return made
+        mesh = finished(parts, maker.looks)
+        if mesh is not None:  # else it is empty or hardly more than a sheet
+            return mesh
 
 
 def make_files(out: Path, count: int, seed: int) -> None:
@@ -79,18 +79,18 @@ def _glb(mesh: TexturedMesh) -> bytes:
 
     scene = trimesh.Scene()
     for number in np.unique(mesh.material_ids):
-        mine = mesh.material_ids == number
+        selected = mesh.material_ids == number
         look = mesh.materials[number]
-        corners = mesh.vertices[mesh.faces[mine]].reshape(-1, 3)
+        corners = mesh.vertices[mesh.faces[selected]].reshape(-1, 3)
         part = trimesh.Trimesh(
             vertices=corners,
             faces=np.arange(len(corners)).reshape(-1, 3),
-            vertex_normals=mesh.normals[mine].reshape(-1, 3),
+            vertex_normals=mesh.normals[selected].reshape(-1, 3),
             process=False,
         )
         image = None if look.texture is None else Image.fromarray(look.texture[..., :3])
         factor = np.rint(255 * look.color).astype(np.uint8)
         surface = PBRMaterial(baseColorTexture=image, baseColorFactor=factor, metallicFactor=0.0)
-        part.visual = TextureVisuals(uv=mesh.uvs[mine].reshape(-1, 2), material=surface)
+        part.visual = TextureVisuals(uv=mesh.uvs[selected].reshape(-1, 2), material=surface)
         scene.add_geometry(part)
     return export_glb(scene)
