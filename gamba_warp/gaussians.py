@@ -48,9 +48,9 @@ class Gaussians:
             if value is not None and tuple(value.shape) != (*lead, size):
                 raise ValueError(f"{name} has shape {tuple(value.shape)}, expected {(*lead, size)}")
         if self.harmonics is not None:
-            found = tuple(self.harmonics.shape)
-            if found not in [(*lead, K, 3) for K in (3, 8, 15)]:
-                raise ValueError(f"harmonics has shape {found}, expected {(*lead, '3|8|15', 3)}")
+            shape = tuple(self.harmonics.shape)
+            if shape not in [(*lead, K, 3) for K in (3, 8, 15)]:
+                raise ValueError(f"harmonics has shape {shape}, expected {(*lead, '3|8|15', 3)}")
 
     @property
     def degree(self) -> int:
