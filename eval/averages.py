@@ -59,11 +59,11 @@ def bootstrap(values: np.ndarray, statistic: Statistic) -> list[float] | None:
     random = np.random.default_rng(SEED)
     batch = max(1, _BATCH // count)
     with np.errstate(all="ignore"):  # a sum may overflow
-        found = [
+        draws = [
             statistic(values[..., random.integers(0, count, (min(batch, RESAMPLES - at), count))])
             for at in range(0, RESAMPLES, batch)
         ]
-        ends = np.quantile(np.concatenate(found), [(1 - LEVEL) / 2, (1 + LEVEL) / 2])
+        ends = np.quantile(np.concatenate(draws), [(1 - LEVEL) / 2, (1 + LEVEL) / 2])
     return ends.tolist()
 
 

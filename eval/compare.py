@@ -170,8 +170,8 @@ def read_report(path: Path) -> Report:
             continue
         try:
             report.records[name] = msgspec.convert(item, _RECORDS[kind])
-            found = flat(item)
-            values = {key: found.get(key) for key in _keys(kind, content.protocol)}
+            by_key = flat(item)
+            values = {key: by_key.get(key) for key in _keys(kind, content.protocol)}
             report.figures[name] = msgspec.convert(values, Figures)
         except msgspec.ValidationError as error:
             raise UserError(f"{path}: {name}: {error}") from error
@@ -238,11 +238,11 @@ def join(methods: dict[str, dict[str, Report]], against: str | None) -> dict[str
         # All protocols have the same thresholds.
         keys = _keys(kind, next((r.protocol for r in reports.values()), {}))
         for key in keys:
-            found = {
+            by_method = {
                 name: {uid: value for uid, v in r.figures.items() if (value := v[key]) is not None}
                 for name, r in reports.items()
             }
-            values[key] = {name: by_uid for name, by_uid in found.items() if by_uid}
+            values[key] = {name: by_uid for name, by_uid in by_method.items() if by_uid}
             uids = map(set, values[key].values())
             common[key] = sorted(set.intersection(*uids)) if values[key] else []
         if reports and not (common[keys[0]] and all(r.records for r in reports.values())):
@@ -262,12 +262,12 @@ def join(methods: dict[str, dict[str, Report]], against: str | None) -> dict[str
 
     def summaries(name: str, less: str | None = None) -> dict[str, Any]:
         """Summarise the figures of a method, or its paired differences to another."""
-        found: dict[str, Any] = dict.fromkeys(values)
+        row: dict[str, Any] = dict.fromkeys(values)
         for key, of in values.items():
             if common[key] and name in of and (less is None or less in of):
                 minus = of[less] if less else dict.fromkeys(common[key], 0.0)
-                found[key] = summary_of([of[name][uid] - minus[uid] for uid in common[key]])
-        return found
+                row[key] = summary_of([of[name][uid] - minus[uid] for uid in common[key]])
+        return row
 
     return {
         "format": FORMAT,

@@ -128,14 +128,14 @@ def over_objects(objects: list[dict[str, Any]], left_out: tuple[str, ...] = ()) 
         except UserError as error:
             checked.append(failure(record["name"], error))
     done = [record for record in checked if record["status"] == OK]
-    numbers = [{k: v for k, v in record.items() if k not in left_out} for record in done]
+    averaged = [{k: v for k, v in record.items() if k not in left_out} for record in done]
     failed = [record for record in checked if record["status"] == FAILED]
     failures = [{"name": record["name"], "reason": record["reason"]} for record in failed]
     return {
         "objects": checked,
-        "mean": mean_of(numbers),
-        "interval": intervals_of(numbers),
-        "median": median_of(numbers),
+        "mean": mean_of(averaged),
+        "interval": intervals_of(averaged),
+        "median": median_of(averaged),
         "num_ok": len(done),
         "num_failed": len(failures),
         "failures": failures,

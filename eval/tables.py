@@ -59,8 +59,8 @@ def figures(
     for row in rows:
         cells = []
         for key, column in columns.items():
-            found = row.figures.get(key)
-            shown = found and cell(found[of], found.get(ends), column.digits, row.signed)
+            figure = row.figures.get(key)
+            shown = figure and cell(figure[of], figure.get(ends), column.digits, row.signed)
             cells.append(shown or "-")
         lines.append([*row.names, *cells])
     return lines

@@ -213,8 +213,8 @@ def plan_outputs(
         renamed += [f"{path}: its results are named {name}"] * (number > 1)
         taken |= outputs_of(name)
         names[name] = path
-    made = [name + suffix for name in names for suffix in suffixes]
-    targets = (folder / name for name in (*made, *own))
+    outputs = [name + suffix for name in names for suffix in suffixes]
+    targets = (folder / name for name in (*outputs, *own))
     check_not_read(targets, [*inputs, *reads])
     for line in renamed:
         say(line)
@@ -235,8 +235,8 @@ def check_not_read(targets: Iterable[Path], reads: Iterable[Path | None]) -> Non
     files: dict[tuple[int, int], Path] = {}
     folders: dict[tuple[int, int], Path] = {}
     for path in reads:
-        if path is not None and (found := identity(path)) is not None:
-            (folders if path.is_dir() else files)[found] = path
+        if path is not None and (node := identity(path)) is not None:
+            (folders if path.is_dir() else files)[node] = path
     for target in targets:
         there = identity(target)
         if there is None:
@@ -244,6 +244,6 @@ def check_not_read(targets: Iterable[Path], reads: Iterable[Path | None]) -> Non
         source = files.get(there)
         if source is None and folders:
             above = (identity(parent) for parent in Path(os.path.realpath(target)).parents)
-            source = next((target for found in above if found in folders), None)
+            source = next((target for node in above if node in folders), None)
         if source is not None:
             raise UserError(f"{source}: would be overwritten by an output; give another --out")

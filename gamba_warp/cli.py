@@ -178,15 +178,15 @@ def _common(arguments: list[str]) -> tuple[list[str], bool, bool]:
     Raises:
         UserError: an option is repeated; tyro would silently keep the last one.
     """
-    found: dict[str, list[str]] = {"-q": [], "-v": []}
+    flags: dict[str, list[str]] = {"-q": [], "-v": []}
     left, seen = [], set()
     for at, word in enumerate(arguments):
         if word == "--":  # no options follow
             left += arguments[at:]
             break
         word = re.sub("^-o(?==|$)", "--out", word)
-        if (short := word.replace("--quiet", "-q").replace("--verbose", "-v")) in found:
-            found[short].append(word)
+        if (short := word.replace("--quiet", "-q").replace("--verbose", "-v")) in flags:
+            flags[short].append(word)
             continue
         if word.startswith("--"):
             name = word.partition("=")[0].replace("_", "-")
@@ -194,7 +194,7 @@ def _common(arguments: list[str]) -> tuple[list[str], bool, bool]:
                 raise UserError(f"{name} may be given only once")
             seen.add(key)
         left.append(word)
-    return left, bool(found["-q"]), bool(found["-v"])
+    return left, bool(flags["-q"]), bool(flags["-v"])
 
 
 # A missing option has the default None, which users cannot give.
@@ -260,8 +260,8 @@ def _reason(event: errors.ParseErrorEvent) -> str:
         names = [_name(missing.arg) for missing in event.missing_arguments]
         return f"missing argument{'s' * (len(names) > 1)}: {', '.join(names)}"
     if isinstance(event, (errors.UnrecognizedArgs, errors.MissingArgs)):
-        given = isinstance(event, errors.UnrecognizedArgs)
-        tokens = event.tokens if given else event.unrecognized_tokens
+        unknown = isinstance(event, errors.UnrecognizedArgs)
+        tokens = event.tokens if unknown else event.unrecognized_tokens
         name = next((token for token in tokens if token.startswith("--")), None)
         if name is None:
             return f"unexpected argument{'s' * (len(tokens) > 1)}: {' '.join(tokens)}"
@@ -379,8 +379,8 @@ def _main(arguments: list[str]) -> int:
         print(__version__)
         return 0
     try:
-        name, rest = _find_command(arguments)
+        name, remaining = _find_command(arguments)
     except UserError as error:
         _print_error(str(error))
         return 2
-    return run(name, rest)
+    return run(name, remaining)

@@ -180,10 +180,10 @@ def sweep(folder: str | Path, age: float = _DAY) -> None:
         age: seconds since the last write; 0 if no other process writes there.
     """
     try:
-        found = [e for e in os.scandir(folder) if _PART_NAME.fullmatch(e.name)]
+        entries = [e for e in os.scandir(folder) if _PART_NAME.fullmatch(e.name)]
     except OSError:
         return
-    for entry in found:
+    for entry in entries:
         try:
             if entry.stat(follow_symlinks=False).st_uid != os.geteuid() or entry.is_symlink():
                 continue
@@ -203,10 +203,10 @@ def sweep(folder: str | Path, age: float = _DAY) -> None:
 def identity(path: str | Path) -> tuple[int, int] | None:
     """Return the device and inode of a file or folder, links followed; None if it is missing."""
     try:
-        found = os.stat(path)
+        status = os.stat(path)
     except (OSError, ValueError):
         return None
-    return found.st_dev, found.st_ino
+    return status.st_dev, status.st_ino
 
 
 def walk(root: str | Path) -> Iterator[tuple[str, list[str], list[str]]]:
@@ -270,12 +270,12 @@ def plain_file(path: str | Path) -> os.stat_result:
         UserError: it is missing or another kind of file.
     """
     try:
-        found = os.stat(path)
+        status = os.stat(path)
     except OSError as error:
         raise UserError(f"{path}: {error.strerror or error}") from error
-    if not stat.S_ISREG(found.st_mode):
+    if not stat.S_ISREG(status.st_mode):
         raise UserError(f"{path}: not a plain file")
-    return found
+    return status
 
 
 def write_json(path: str | Path, value: object) -> None:

@@ -149,10 +149,10 @@ class ObjectFiles:
     def suffixes(self, meshes: bool = True) -> list[str]:
         """Return the suffixes of an object's files, meshes last."""
         options = self.options
-        found = [splat_suffix(kind) for kind in options.splats]
-        found += [f".{options.turntable}"] if options.turntable != "none" else []
-        found += [".html"] if options.page else []
-        return found + (mesh_suffixes(self.mesh, self.texture) if meshes else [])
+        suffixes = [splat_suffix(kind) for kind in options.splats]
+        suffixes += [f".{options.turntable}"] if options.turntable != "none" else []
+        suffixes += [".html"] if options.page else []
+        return suffixes + (mesh_suffixes(self.mesh, self.texture) if meshes else [])
 
     def require(self) -> None:
         """Raise ModuleNotFoundError if a required library is not installed."""

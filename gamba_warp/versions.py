@@ -78,27 +78,27 @@ def installed(*packages: str) -> dict[str, str]:
     """Return versions of the installed ones among the packages, by their names on PyPI."""
     from importlib.metadata import PackageNotFoundError, version
 
-    found = {}
+    versions = {}
     for package in packages:
         try:
-            found[package] = version(package)
+            versions[package] = version(package)
         except PackageNotFoundError:
             continue
-    return found
+    return versions
 
 
 def used_versions() -> dict[str, str]:
     """Return versions of this package, Python and every dependency, by name."""
     import platform
 
-    found = installed(*_USED)
+    versions = installed(*_USED)
     named = {
         "gamba_warp": __version__,
         "python": f"{platform.python_version()} on {platform.system()} {platform.machine()}",
     }
     for name in _USED:
-        if name in found or not name.startswith("open3d"):  # one of its two packages is enough
-            named[name] = found.get(name, "not installed")
+        if name in versions or not name.startswith("open3d"):  # one of its two packages is enough
+            named[name] = versions.get(name, "not installed")
     return named
 
 

@@ -101,7 +101,7 @@ class TrainingData:
         if self.shards is not None:
             urls = [url for url in self.shards.urls if "://" not in url]
             return {os.path.basename(url): str(_size(url)) for url in urls}
-        chosen, found = sorted(set(self.objects)), {}
+        chosen, hashes = sorted(set(self.objects)), {}
         read, sized = (set(evenly(chosen, count)) for count in (_READ, _SIZED))
         step = max(1, math.ceil(len(chosen) / _SIZED))
         for part in (chosen[at : at + step] for at in range(0, len(chosen), step)):
@@ -117,8 +117,8 @@ class TrainingData:
                         with suppress(OSError):  # the training reports it when it matters
                             digest.update(paths[0].read_bytes())
             names = dict.fromkeys(self.train.uids[index] for index in (part[0], part[-1]))
-            found[" to ".join(names)] = digest.hexdigest()[:16]
-        return found
+            hashes[" to ".join(names)] = digest.hexdigest()[:16]
+        return hashes
 
     @property
     def content(self) -> str:
@@ -194,7 +194,7 @@ def _open_shards(config: TrainConfig, source: str) -> TrainingData:
         UserError: the index is invalid, or an option needs a folder of objects.
     """
     needs_folders = {"--extra": config.views.extra, "--cache": config.views.cache}
-    for name in (name for name, given in needs_folders.items() if given):
+    for name in (name for name, value in needs_folders.items() if value):
         raise UserError(f"{name}: needs a folder of objects, and {config.data} has shards")
     shards, notes, held_out = Shards(source, "train"), [], None
     try:
@@ -321,16 +321,16 @@ class Batches:
         def loaded(dataset: ViewDataset, index: int) -> Batch:
             first = None
             if front:
-                found = front_views(dataset.files(index).camera_to_world)
-                first = found[pick % len(found)]
+                fronts = front_views(dataset.files(index).camera_to_world)
+                first = fronts[pick % len(fronts)]
             chosen = choose_views(dataset.num_views(index), novel, first, rng)
             about = (views.size, self.model, background, change, surfaces)
             return load_sample(dataset, index, chosen, *about)
 
-        made = self._procedural_sample(number)
-        if made is not None:
+        sample = self._procedural_sample(number)
+        if sample is not None:
             assert self._procedural is not None
-            return Prepared(loaded(self._procedural.take(made), 0), [])
+            return Prepared(loaded(self._procedural.take(sample), 0), [])
         failed: list[tuple[str, str]] = []
         for attempt in range(_TRIES):
             dataset, index = self.data.train, 0

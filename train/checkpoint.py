@@ -244,8 +244,8 @@ def step_of(checkpoint: Path) -> int:
 def list_checkpoints(run: Path) -> list[Path]:
     """List the run's checkpoints, oldest first."""
     folder = run / "checkpoints"
-    found = [p for p in folder.iterdir() if _NAME.fullmatch(p.name)] if folder.is_dir() else []
-    return sorted(found, key=step_of)
+    paths = [p for p in folder.iterdir() if _NAME.fullmatch(p.name)] if folder.is_dir() else []
+    return sorted(paths, key=step_of)
 
 
 def save_checkpoint(run: Path, step: int, models: dict[str, Gamba], state: dict, keep: int) -> Path:
@@ -305,16 +305,16 @@ def find_checkpoint(
             checkpoint is damaged; the message names the newest intact one.
     """
     if resume in ("auto", "never"):
-        found = list_checkpoints(run)
-        if found and resume == "never":
+        checkpoints = list_checkpoints(run)
+        if checkpoints and resume == "never":
             raise UserError(f"{run}: already holds a run; give another --out or --resume auto")
-        return _newest_whole(found, warn) if found else None
+        return _newest_whole(checkpoints, warn) if checkpoints else None
     path = Path(resume)
     if not (path / "state.pt").is_file():
-        found = list_checkpoints(path)
-        if not found:
+        checkpoints = list_checkpoints(path)
+        if not checkpoints:
             raise UserError(f"--resume {path}: no checkpoint found")
-        path = found[-1]
+        path = checkpoints[-1]
     reason = damage(path)
     if reason:
         beside = [p for p in list_checkpoints(path.parent.parent) if p != path]
@@ -324,10 +324,10 @@ def find_checkpoint(
     return path
 
 
-def _newest_whole(found: list[Path], warn: Callable[[str], None]) -> Path:
+def _newest_whole(checkpoints: list[Path], warn: Callable[[str], None]) -> Path:
     """Return the newest intact checkpoint. Raises UserError if all are damaged."""
     reasons = []
-    for checkpoint in reversed(found):
+    for checkpoint in reversed(checkpoints):
         reason = damage(checkpoint)
         if not reason:
             for text in reasons:
@@ -421,8 +421,8 @@ def read_run(checkpoint: Path, setup: Setup) -> tuple[Stored, LengthConfig]:
     there = plan.views.batch_size * plan.views.accumulate * stored.world_size
     here = setup.step_size
     if here != there:
-        each, rest = divmod(there, config.views.accumulate * processes)
-        way = "" if rest else f": --batch-size {each} keeps it"
+        each, remainder = divmod(there, config.views.accumulate * processes)
+        way = "" if remainder else f": --batch-size {each} keeps it"
         differing.append(f"objects a step ({there} there, {here} here{way})")
     if differing:
         raise UserError(
@@ -449,8 +449,8 @@ def find_initial(path: Path, warn: Callable[[str], None] = warnings.warn) -> Pat
         reason = damage(path)
         if reason:
             raise UserError(f"--init {reason}")
-    elif found := list_checkpoints(path):
-        path = _newest_whole(found, warn)
+    elif checkpoints := list_checkpoints(path):
+        path = _newest_whole(checkpoints, warn)
     names = [name for name in ("ema.safetensors", "model.safetensors") if (path / name).is_file()]
     if not names:
         raise UserError(f"--init {path}: holds neither a model nor a checkpoint")

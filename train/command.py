@@ -64,21 +64,21 @@ def expand(arguments: list[str]) -> list[str]:
     at = words.index(chosen)
     if at + 1 == len(words):
         raise UserError(f"{chosen}: expected a recipe's name, or a run's folder or config.json")
-    name, rest = words[at + 1], [*words[:at], *words[at + 2 :]]
+    name, remaining = words[at + 1], [*words[:at], *words[at + 2 :]]
     if helped:
         print(table_of(name) + "\n")
-        return rest
+        return remaining
     # DATA may come first, last with a recipe, and after the one value of --config.
-    first = rest[:1] if rest and not rest[0].startswith("-") else []
+    first = remaining[:1] if remaining and not remaining[0].startswith("-") else []
     if chosen == "--recipe":
-        taken = recipe_words(name, rest, os.environ)
+        taken = recipe_words(name, remaining, os.environ)
         announce(taken)
-        return [*first, *taken, *rest[len(first) :]]
+        return [*first, *taken, *remaining[len(first) :]]
     data, *taken = _options_of(Path(name))
-    if not first and rest[at : at + 1] and not rest[at].startswith("-"):
-        first = [rest.pop(at)]
-        return [*first, *taken, *rest]
-    return [*(first or [data]), *taken, *rest[len(first) :]]
+    if not first and remaining[at : at + 1] and not remaining[at].startswith("-"):
+        first = [remaining.pop(at)]
+        return [*first, *taken, *remaining]
+    return [*(first or [data]), *taken, *remaining[len(first) :]]
 
 
 def _options_of(path: Path) -> list[str]:

@@ -324,11 +324,11 @@ _RENAMED = {
 
 def renamed(values: Mapping[str, Any]) -> dict[str, Any]:
     """Return a ``to_dict`` value with the present names of an earlier version's options."""
-    found = dict(values)
+    present = dict(values)
     for group, names in _RENAMED.items():
-        if isinstance(options := found.get(group), dict):
-            found[group] = {names.get(name, name): value for name, value in options.items()}
-    return found
+        if isinstance(options := present.get(group), dict):
+            present[group] = {names.get(name, name): value for name, value in options.items()}
+    return present
 
 
 def config_of(values: Mapping[str, Any], source: str) -> TrainConfig:

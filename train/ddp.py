@@ -80,10 +80,10 @@ class World:
 
     def gather(self, value: Any) -> list[Any]:
         """Gather a picklable value from all processes, by rank."""
-        found = [value] * self.size
+        gathered = [value] * self.size
         if self.size > 1:
-            dist.all_gather_object(found, value)
-        return found
+            dist.all_gather_object(gathered, value)
+        return gathered
 
     def broadcast_from_main(self, action: Callable[[], Result]) -> Result:
         """Run an action on the main process and broadcast its picklable result.

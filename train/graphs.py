@@ -104,17 +104,17 @@ class StepGraphs:
             self._pool = None  # torch refuses one whose graphs are all gone while tensors use it
             forget_graphs()
         shape = key, *((x.shape, x.dtype) if isinstance(x, Tensor) else x for x in _fields(batch))
-        found = self._graphs.get(shape)
-        if found is None and self._times[shape] and self._can_add(shape):
-            found = self._capture(shape, batch, step)
+        recorded = self._graphs.get(shape)
+        if recorded is None and self._times[shape] and self._can_add(shape):
+            recorded = self._capture(shape, batch, step)
         self._times[shape] += 1
-        if found is None:
+        if recorded is None:
             return step(batch)
-        for own, given in zip(_fields(found.batch), _fields(batch), strict=True):
-            if isinstance(own, Tensor):
-                own.copy_(given)
-        found.graph.replay()
-        return found.result
+        for static, fresh in zip(_fields(recorded.batch), _fields(batch), strict=True):
+            if isinstance(static, Tensor):
+                static.copy_(fresh)
+        recorded.graph.replay()
+        return recorded.result
 
     def _can_add(self, shape: Hashable) -> bool:
         """Return True if a graph may be added, in place of one of a rarer shape if need be."""
@@ -130,19 +130,19 @@ class StepGraphs:
         self, shape: Hashable, batch: Batch, step: Callable[[Batch], Any]
     ) -> _Recorded | None:
         """Capture a step, which does not run it; None if that fails."""
-        own = copied(batch)
+        static = copied(batch)
         on_gpu = self._device.type == "cuda"
         state = torch.cuda.get_rng_state(self._device) if on_gpu else None
         try:
-            graph, result = self._record(lambda: step(own))
+            graph, result = self._record(lambda: step(static))
         except Exception as error:  # of torch, a library or the driver; steps work without graphs
             if state is not None:  # which a capture that failed may have left unusable
                 torch.cuda.set_rng_state(state, self._device)
             self._most = len(self._graphs)  # of steps that fit, which stay
             self._say(f"no CUDA graph of a step: {first_line(error)}; such steps run one by one")
             return None
-        found = self._graphs[shape] = _Recorded(graph, own, result)
-        return found
+        recorded = self._graphs[shape] = _Recorded(graph, static, result)
+        return recorded
 
     @contextmanager
     def _on_stream(self) -> Iterator[None]:

@@ -207,8 +207,8 @@ class Outcomes:
         state, loss, norm = self._state, math.nan, math.nan
         while len(self._unread) > late:
             step, stats = self._unread.popleft()
-            own, norm, bad = stats.tolist()
-            (summed,) = self._world.total(own)
+            own_loss, norm, bad = stats.tolist()
+            (summed,) = self._world.total(own_loss)
             loss = summed / self._world.size
             if not bad:
                 state.skipped_in_row = 0

@@ -100,19 +100,19 @@ def recipe_words(name: str, arguments: Sequence[str], environment: Mapping[str, 
         UserError: the recipe is unknown, or its batch does not divide by the processes and
             accumulated batches.
     """
-    recipe, given = _recipe_of(name), {}
+    recipe, options = _recipe_of(name), {}
     for word, following in zip(arguments, [*arguments[1:], ""]):  # the last of each name counts
         key, equals, value = word.partition("=")
-        given[key.replace("_", "-")] = value if equals else following
+        options[key.replace("_", "-")] = value if equals else following
     words = ["--recipe", name, *(word for text in recipe.settings for word in shlex.split(text))]
-    if recipe.batch is None or option("batch_size") in given:
+    if recipe.batch is None or option("batch_size") in options:
         return words
-    processes, accumulate = environment.get("WORLD_SIZE", "1"), given.get("--accumulate", "1")
+    processes, accumulate = environment.get("WORLD_SIZE", "1"), options.get("--accumulate", "1")
     for text, what in ((processes, "WORLD_SIZE"), (accumulate, "--accumulate")):
         if not re.fullmatch("0*[1-9][0-9]{0,5}", text):
             raise UserError(f"{what} {text[:40]}: expected a number from 1 to 999,999")
-    fraction, rest = divmod(recipe.batch, int(processes) * int(accumulate))
-    if rest:
+    fraction, remainder = divmod(recipe.batch, int(processes) * int(accumulate))
+    if remainder:
         raise UserError(
             f"--recipe {name}: its batch of {recipe.batch} does not divide by {processes} "
             f"processes times --accumulate {accumulate}; change one of them, or give --batch-size"
@@ -121,10 +121,10 @@ def recipe_words(name: str, arguments: Sequence[str], environment: Mapping[str, 
 
 
 def _recipe_of(name: str) -> Recipe:
-    found = {str(known): recipe for known, recipe in RECIPES.items()}
-    if name not in found:
-        raise UserError(f"--recipe {name[:40]}: expected one of {', '.join(found)}")
-    return found[name]
+    by_name = {str(known): recipe for known, recipe in RECIPES.items()}
+    if name not in by_name:
+        raise UserError(f"--recipe {name[:40]}: expected one of {', '.join(by_name)}")
+    return by_name[name]
 
 
 def table_of(name: str) -> str:

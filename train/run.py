@@ -56,10 +56,10 @@ class RunFolder(contextlib.ExitStack):
                 self.enter_context(only_process(self.path, "trains"))
             return find_checkpoint(self.path, resume, warn)
 
-        found = self.world.broadcast_from_main(find)
+        checkpoint = self.world.broadcast_from_main(find)
         if resume != "auto":
-            return found
-        taken = -1 if found is None else step_of(found)
+            return checkpoint
+        taken = -1 if checkpoint is None else step_of(checkpoint)
         seen = self.world.gather((socket.gethostname(), list_checkpoints(self.path)))
         host, known = seen[0]
         steps = {step_of(path) for path in known}
@@ -70,7 +70,7 @@ class RunFolder(contextlib.ExitStack):
                     f"process {rank} on {other} sees {newer[-1]}, process 0 on {host} does not: "
                     "start with that machine as the first, or give a shared folder as --out"
                 )
-        return found
+        return checkpoint
 
     def open_log(self) -> RunLog:
         """Make and lock the folder on the main process, and open the log.

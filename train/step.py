@@ -86,8 +86,8 @@ def forward(model: Callable, batch: Batch, objective: Objective) -> StepResult:
     """
     weights, lpips, crop, precision = objective
     with network_precision(batch.inputs.device, precision):
-        own = {} if batch.foreground is None else {"foreground": batch.foreground}
-        gaussians = model(batch.inputs, batch.input_cameras, **own)
+        optional = {} if batch.foreground is None else {"foreground": batch.foreground}
+        gaussians = model(batch.inputs, batch.input_cameras, **optional)
     rendering = render(gaussians, batch.cameras, batch.background)
     target = over_background(batch.targets, batch.background[..., None, None, :])
     inputs = LossInputs(
@@ -259,9 +259,9 @@ def make_step(
             return eager(batches, weights, rate, fraction)
         (batch,) = batches
         number, key = graphs.number, tuple(sorted(n for n, w in weights.items() if w))
-        given = {n: w if n == "novel" else number(n, w) for n, w in weights.items() if w}
-        rest = number("learning rate", rate), number("fraction of the average", fraction)
-        step = graphs.run(batch, key, lambda own: eager([own], given, *rest))
+        graph_weights = {n: w if n == "novel" else number(n, w) for n, w in weights.items() if w}
+        rates = number("learning rate", rate), number("fraction of the average", fraction)
+        step = graphs.run(batch, key, lambda static: eager([static], graph_weights, *rates))
         return step._replace(stats=step.stats.clone())  # the next step of a graph overwrites it
 
     return run
@@ -295,9 +295,9 @@ def health(result: StepResult, batch: Batch) -> dict[str, Tensor]:
 def means(step: Step) -> dict[str, float]:
     """Read the means of the loss terms of a step's last batch, and its ``health``."""
     terms = {f"loss_{n}": term.mean() for n, term in step.result.terms.items()}
-    found = terms | health(step.result, step.batch)
-    values = torch.stack([value.double() for value in found.values()]).tolist()
-    return dict(zip(found, values))
+    tensors = terms | health(step.result, step.batch)
+    values = torch.stack([value.double() for value in tensors.values()]).tolist()
+    return dict(zip(tensors, values))
 
 
 def collapse_reason(figures: Mapping[str, float]) -> str | None:

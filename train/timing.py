@@ -110,10 +110,10 @@ class Step:
         kind = "device_time_total" if on_gpu else "cpu_time_total"
         # The profiler's library prints that there is no driver, and its own beginning and end.
         os.environ.setdefault("KINETO_LOG_LEVEL", "99")
-        found = profile(use_device="cuda" if on_gpu else None, use_kineto=on_gpu)
-        with found:
+        profiler = profile(use_device="cuda" if on_gpu else None, use_kineto=on_gpu)
+        with profiler:
             self.plain([self.batch], self.weights, _RATE)
-        events = found.key_averages()
+        events = profiler.key_averages()
         whole = sum(getattr(event, f"self_{kind}") for event in events) or 1
         fractions = {
             f"fraction of {part}": sum(getattr(e, kind) for e in events if e.key.startswith(names))
@@ -134,13 +134,13 @@ def steps(settings: Settings) -> list[Variant]:
     random colours; on a GPU repeated as a CUDA graph. LPIPS is left out without its weights. The
     only check is that the gradient is finite.
     """
-    made: list[Variant] = []
+    variants: list[Variant] = []
     on_gpu, quick = settings.device.type == "cuda", settings.level == "quick"
     lpips = load_lpips() if lpips_available() else None
     for objects in (2,) if quick else (8, 64) if on_gpu else (8, 16):
         for precision in (torch.float32, torch.bfloat16):
             step = Step(objects, settings.device, on_gpu, precision, lpips)
-            made.append(
+            variants.append(
                 Variant(
                     f"rays, {objects} objects" + (", without LPIPS" if lpips is None else ""),
                     step.run,
@@ -152,4 +152,4 @@ def steps(settings: Settings) -> list[Variant]:
                     work=step.work,
                 )
             )
-    return made
+    return variants

@@ -62,10 +62,10 @@ def aligned(
     for step in steps:
         moved = transform.apply(predicted)
         if step in ("rigid", "icp"):
-            found, residual = icp(moved, gt, with_scale=step == "icp")
+            correction, residual = icp(moved, gt, with_scale=step == "icp")
         else:
-            found = _SEARCHES[step](moved, gt)
-        transform = found.of(transform)
+            correction = _SEARCHES[step](moved, gt)
+        transform = correction.of(transform)
     return transform, residual
 
 
@@ -165,16 +165,16 @@ def symmetry(gt: Points) -> list[list[float]]:
     order = np.random.default_rng(1).permutation(len(gt.positions))
     halves = [_Cloud.of(Points(gt.positions[part])) for part in (order[::2], order[1::2])]
     turns, _, chamfer = _candidates(*halves, also=np.eye(3)[None])
-    found: list[list[float]] = []
-    kept = np.eye(3)[None]
+    symmetries: list[list[float]] = []
+    rotations = np.eye(3)[None]
     for at in chamfer.argsort():
         # The minimum belongs to the identity, up to the points' noise.
-        if chamfer[at] <= ALIKE * chamfer.min() and (_degrees(turns[at], kept) >= APART).all():
-            kept = np.concatenate([kept, turns[at][None]])
+        if chamfer[at] <= ALIKE * chamfer.min() and (_degrees(turns[at], rotations) >= APART).all():
+            rotations = np.concatenate([rotations, turns[at][None]])
             vector = Rotation.from_matrix(turns[at]).as_rotvec(degrees=True)
             angle = float(np.linalg.norm(vector))
-            found.append([round(float(x), 3) for x in (*vector / angle, angle)])
-    return found
+            symmetries.append([round(float(x), 3) for x in (*vector / angle, angle)])
+    return symmetries
 
 
 class _Cloud(NamedTuple):
@@ -221,13 +221,13 @@ def _cells(points: np.ndarray, reach: float) -> np.ndarray:
 
 def _chamfer(one: _Cloud, two: _Cloud, turns: np.ndarray, count: int) -> np.ndarray:
     """Return Chamfer distances ``[M]`` after each rotation ``[M, 3, 3]`` of the first cloud."""
-    found = np.empty(len(turns))
+    sums = np.empty(len(turns))
     for at in range(0, len(turns), 256):  # bounds the memory
         part = turns[at : at + 256]
         there = one.points[:count] @ part.transpose(0, 2, 1)
         back = two.points[:count] @ part
-        found[at : at + 256] = _lengths(there - two.near(there)) + _lengths(back - one.near(back))
-    return found / 2
+        sums[at : at + 256] = _lengths(there - two.near(there)) + _lengths(back - one.near(back))
+    return sums / 2
 
 
 def _lengths(vectors: np.ndarray) -> np.ndarray:
@@ -246,13 +246,13 @@ def _candidates(
         also: further initial rotations ``[.., 3, 3]``.
     """
     every = spread_rotations(TURNS)
-    kept = np.empty((0, 3, 3)) if also is None else also
+    starts = np.empty((0, 3, 3)) if also is None else also
     for turn in every[_chamfer(one, two, every, SCORED).argsort()]:
-        if len(kept) == CANDIDATES:
+        if len(starts) == CANDIDATES:
             break
-        if (_degrees(turn, kept) >= APART).all():
-            kept = np.concatenate([kept, turn[None]])
-    turns, moves = kept, np.zeros((len(kept), 3))
+        if (_degrees(turn, starts) >= APART).all():
+            starts = np.concatenate([starts, turn[None]])
+    turns, moves = starts, np.zeros((len(starts), 3))
     points = one.points[:FOLLOWED]
     for _ in range(ROUNDS):
         moved = points @ turns.transpose(0, 2, 1) + moves[:, None]

@@ -40,15 +40,15 @@ def clean_mesh(mesh: Mesh, intersections: bool = False) -> tuple[Mesh, list[str]
     rank = np.lexsort(order.T)  # equal rows adjacent, in the order of the file
     repeated = np.zeros(len(faces), bool)
     repeated[rank[1:]] = (order[rank[1:]] == order[rank[:-1]]).all(1)
-    kept = Mesh(vertices, faces[~flat & ~repeated])
-    found = _edge_flags(kept)
+    cleaned = Mesh(vertices, faces[~flat & ~repeated])
+    flags = _edge_flags(cleaned)
     if flat.any():
-        found.add("degenerate")
+        flags.add("degenerate")
     if (repeated & ~flat).any():
-        found.add("duplicate")
-    if intersections and len(kept.faces) and _cuts_itself(kept):
-        found.add("selfintersecting")
-    return kept, [flag for flag in FLAGS if flag in found]
+        flags.add("duplicate")
+    if intersections and len(cleaned.faces) and _cuts_itself(cleaned):
+        flags.add("selfintersecting")
+    return cleaned, [flag for flag in FLAGS if flag in flags]
 
 
 def _edge_flags(mesh: Mesh) -> set[str]:
@@ -60,12 +60,12 @@ def _edge_flags(mesh: Mesh) -> set[str]:
         "nonmanifold": (counts > 2).any(),
         "inconsistent": (balance[counts == 2] != 0).any(),
     }
-    found = {flag for flag, yes in there.items() if yes}
-    if not found & {"open", "inconsistent"}:
+    flags = {flag for flag, yes in there.items() if yes}
+    if not flags & {"open", "inconsistent"}:
         corners = (mesh.vertices - mesh.vertices.mean(0))[mesh.faces]
         if (corners[:, 0] * np.cross(corners[:, 1], corners[:, 2])).sum() < 0:  # 6 volumes, signed
-            found.add("inverted")
-    return found
+            flags.add("inverted")
+    return flags
 
 
 def _cuts_itself(mesh: Mesh) -> bool:

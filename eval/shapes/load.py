@@ -105,9 +105,9 @@ def load_gt(
         if abs(turn @ turn.T - np.eye(3)).max() > ROUNDED or np.linalg.det(turn) < 0:
             raise UserError("its catalogue's rotation stretches or mirrors, which is invalid")
         transform = unit_transform(shape, turn)
-        found = _loaded(shape, transform.apply(shape), transform, axes, protocol)
-        found.warnings[:0] = warnings
-        return found
+        loaded = _loaded(shape, transform.apply(shape), transform, axes, protocol)
+        loaded.warnings[:0] = warnings
+        return loaded
     except UserError as error:
         raise UserError(f"{path}: {error}") from error
 
@@ -185,14 +185,14 @@ def load_shape(path: Path) -> tuple[Shape, str]:
     Raises:
         UserError: as for ``read``, or coordinates are beyond ``HUGE``.
     """
-    found, axes, *_ = read(path)
+    stored, axes, *_ = read(path)
     shape: Shape
-    if isinstance(found, Gaussians):
-        shape = found
-    elif isinstance(found, Cloud):
-        shape = Points(*found)
+    if isinstance(stored, Gaussians):
+        shape = stored
+    elif isinstance(stored, Cloud):
+        shape = Points(*stored)
     else:
-        shape = Mesh(found.vertices, found.faces, tuple(found.omitted), found.flat)
+        shape = Mesh(stored.vertices, stored.faces, tuple(stored.omitted), stored.flat)
     if (reach := np.abs(positions_of(shape)).max()) > HUGE:
         raise UserError(f"{path}: coordinates reach {reach:.3g}, over {HUGE:g}")
     return shape, axes

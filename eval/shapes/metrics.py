@@ -72,10 +72,10 @@ def align_shape(
         return predicted, {}
     points, true_points = (take_points(s, protocol, protocol.seed) for s in (predicted, gt))
     transform, residual = aligned(points, true_points, protocol.align)
-    found: dict[str, Any] = {"alignment": transform.record() | residual}
+    record: dict[str, Any] = {"alignment": transform.record() | residual}
     if {"yaw", "turn"} & set(protocol.align):
-        found["gt_symmetry"] = symmetry(true_points)
-    return transform.apply(predicted), found
+        record["gt_symmetry"] = symmetry(true_points)
+    return transform.apply(predicted), record
 
 
 def point_metrics(
@@ -83,8 +83,8 @@ def point_metrics(
 ) -> dict[str, Any]:
     """Compute ``surface_metrics`` of points of two shapes, and ``noise_floor``."""
     points, true_points = (take_points(s, protocol, protocol.seed) for s in (predicted, gt))
-    found = surface_metrics(points, true_points, protocol)
-    return found | {"noise_floor": noise_floor(gt, protocol, true_points)}
+    metrics = surface_metrics(points, true_points, protocol)
+    return metrics | {"noise_floor": noise_floor(gt, protocol, true_points)}
 
 
 def take_points(shape: Mesh | Points, protocol: GeometryProtocol, seed: int) -> Points:
@@ -120,8 +120,8 @@ def noise_floor(gt: Mesh | Points, protocol: GeometryProtocol, points: Points) -
         one, two = halves(gt, protocol.num_points, protocol.seed)
     else:
         one, two = points, take_points(gt, protocol, protocol.seed + 1)
-    found = protocol.unit * nearest(two, one)[0].astype(np.float64)
-    return _chamfer(found, found, protocol.chamfer)
+    distances = protocol.unit * nearest(two, one)[0].astype(np.float64)
+    return _chamfer(distances, distances, protocol.chamfer)
 
 
 def shape_iou(
@@ -177,7 +177,7 @@ def chamfer_by_transform(
     """
     true = Points(sample(gt.shape, _FEW, protocol.seed).positions)
     few = (_FEW, protocol.seed + 1)
-    source, found = predicted.source, {}
+    source, chamfers = predicted.source, {}
     of = sample(source, *few)
     points = of.positions
     searched = (AS_IS, f"{MIRRORED} along x")
@@ -185,8 +185,8 @@ def chamfer_by_transform(
         turned = Points(predicted.transform.after(TRANSFORMS[name]).points(points))
         turned = aligned(turned, true, protocol.align)[0].apply(turned)
         ways = nearest(turned, true), nearest(true, turned)
-        found[name] = float(np.mean([distances.mean() for distances, _ in ways]))
-    return found
+        chamfers[name] = float(np.mean([distances.mean() for distances, _ in ways]))
+    return chamfers
 
 
 def surface_metrics(predicted: Points, gt: Points, protocol: GeometryProtocol) -> dict:
@@ -207,7 +207,7 @@ def surface_metrics(predicted: Points, gt: Points, protocol: GeometryProtocol) -
     """
     there, there_at = nearest(predicted, gt)
     back, back_at = nearest(gt, predicted)
-    there, back = (protocol.unit * found.astype(np.float64) for found in (there, back))
+    there, back = (protocol.unit * distances.astype(np.float64) for distances in (there, back))
     fscore = {}
     for threshold in protocol.thresholds:
         precision, recall = np.mean(there <= threshold), np.mean(back <= threshold)

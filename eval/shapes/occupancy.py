@@ -135,8 +135,8 @@ def winding(mesh: Mesh, grid: Grid) -> np.ndarray:
     scene, points, normals = mesh.scene(), grid.points().reshape(-1, 3), mesh.normals()
     total = np.zeros(len(points))
     for direction in directions():
-        found = scene.list_intersections(_rays(points, direction))
-        ray, face = (found[key].numpy().astype(np.int64) for key in ("ray_ids", "primitive_ids"))
+        hits = scene.list_intersections(_rays(points, direction))
+        ray, face = (hits[key].numpy().astype(np.int64) for key in ("ray_ids", "primitive_ids"))
         total += np.bincount(ray, np.sign(normals @ direction)[face], len(points))
     return (2 * np.abs(total) > VOTERS).reshape(grid.shape)
 
@@ -249,10 +249,10 @@ def open_parts(mesh: Mesh) -> list[Mesh]:
     links = coo_array((np.ones(len(face), bool), (face, len(faces) + edge)), shape=(size, size))
     label = connected_components(links, directed=False)[1][: len(faces)]
     odd = (count[edge] % 2 == 1) & (edges[:, 0] != edges[:, 1])  # as in Mesh.is_closed
-    kept = np.flatnonzero(np.isin(label, label[face[odd]]))
-    kept = kept[np.argsort(label[kept], kind="stable")]
+    open_faces = np.flatnonzero(np.isin(label, label[face[odd]]))
+    open_faces = open_faces[np.argsort(label[open_faces], kind="stable")]
     parts = []
-    for ids in np.split(kept, np.flatnonzero(np.diff(label[kept])) + 1):
+    for ids in np.split(open_faces, np.flatnonzero(np.diff(label[open_faces])) + 1):
         used, corners = np.unique(faces[ids], return_inverse=True)
         parts.append(Mesh(vertices[used], corners.reshape(-1, 3)))
     return parts

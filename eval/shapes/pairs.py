@@ -104,11 +104,11 @@ def open_objects(data: Path | None) -> tuple[ViewDataset, Objects] | tuple[None,
 
 def _by_name(uids: Iterable[str], folder: Path) -> dict[str, str]:
     """Return uids by the names of their files. Raises UserError if two have one name."""
-    uids, found = list(uids), dict[str, str]()
+    uids, by_name = list(uids), dict[str, str]()
     for name, uid in zip(object_names([PurePosixPath(uid) for uid in uids]), uids):
-        if found.setdefault(name, uid) != uid:
-            raise UserError(f"{folder}: '{uid}' and '{found[name]}' have the same name, '{name}'")
-    return found
+        if by_name.setdefault(name, uid) != uid:
+            raise UserError(f"{folder}: '{uid}' and '{by_name[name]}' have the same name, '{name}'")
+    return by_name
 
 
 def evaluate_shapes(options: ShapesOptions, protocol: GeometryProtocol) -> dict[str, Any]:
@@ -232,9 +232,9 @@ def open_pairs(
         from gamba_warp.data.dataset import evenly
 
         names = {pair.name for pair in pairs} | {each["name"] for each in failures}
-        kept = {*evenly(sorted(names), options.limit)}
-        pairs = [pair for pair in pairs if pair.name in kept]
-        failures = [each for each in failures if each["name"] in kept]
+        chosen = {*evenly(sorted(names), options.limit)}
+        pairs = [pair for pair in pairs if pair.name in chosen]
+        failures = [each for each in failures if each["name"] in chosen]
     return dataset, pairs, failures
 
 
@@ -303,13 +303,13 @@ def _shapes_in(folder: Path, rendered: Container[str] = ()) -> dict[str, list[Pa
     warn_of_others(folder, files, SHAPE_SUFFIXES)
     paths = sorted(path for path in files if path.suffix.lower() in SHAPE_SUFFIXES)
     names = object_names([path.relative_to(folder).with_suffix("") for path in paths])
-    found: dict[str, list[Path]] = {}
+    shapes: dict[str, list[Path]] = {}
     for name, path in zip(names, paths):
         other = f"{name}-{path.suffix[1:].lower()}"
-        found.setdefault(other if name in found and other in rendered else name, []).append(path)
-    if not found:
+        shapes.setdefault(other if name in shapes and other in rendered else name, []).append(path)
+    if not shapes:
         raise UserError(f"{folder}: contains no files of type {', '.join(SHAPE_SUFFIXES)}")
-    return found
+    return shapes
 
 
 def out_of_reference(dataset: ViewDataset, uid: str, reference: int, distance: float) -> Similarity:
@@ -424,8 +424,8 @@ def evaluate_pairs(
     objects = [record for key in keys if (record := cache.get(key))]
     left = [at for at, key in enumerate(keys) if cache.get(key) is None]
     waiting = [pairs[at] for at in left]
-    found = run_each(attempt, waiting, workers=workers, seconds=PAIR_SECONDS)
-    for index, result in progress_bar(found, total=len(waiting), unit="object"):
+    results = run_each(attempt, waiting, workers=workers, seconds=PAIR_SECONDS)
+    for index, result in progress_bar(results, total=len(waiting), unit="object"):
         if isinstance(result, Failed):
             result = failure(waiting[index].name, result.reason)
         cache.add(keys[left[index]], result)

@@ -168,14 +168,14 @@ def chosen_protocol(options: ShapesOptions) -> GeometryProtocol:
     base = read_protocol(options.protocol)
     check_options(options)
     names = ("seed", "frame", "up", "pred_axes", "reference", "distance")
-    given = {name: getattr(options, name) for name in names}
-    given |= {"num_points": options.points, "strict": options.strict or None}
+    outer = {name: getattr(options, name) for name in names}
+    outer |= {"num_points": options.points, "strict": options.strict or None}
     if options.align is not None:
-        given["align"] = tuple(step for step in options.align if step != "none")
+        outer["align"] = tuple(step for step in options.align if step != "none")
     surface = {name: getattr(options, name) for name in ("voxels", "views", "pixels")}
     surface["method"] = options.surface
-    given, surface = ({k: v for k, v in part.items() if v is not None} for part in (given, surface))
-    chosen = replace(base, surface=replace(base.surface, **surface), **given)
+    outer, surface = ({k: v for k, v in part.items() if v is not None} for part in (outer, surface))
+    chosen = replace(base, surface=replace(base.surface, **surface), **outer)
     return with_fields(chosen, options.set) if options.set else chosen
 
 
@@ -189,13 +189,13 @@ def with_fields(protocol: GeometryProtocol, texts: Sequence[str]) -> GeometryPro
     """
     value = protocol.fields()
     for text in texts:
-        field, sign, given = text.partition("=")
+        field, sign, literal = text.partition("=")
         inner, _, name = field.rpartition(".")
         target = value["surface"] if inner == "surface" else value
         if not sign or inner not in ("", "surface") or name not in target or field == "surface":
             known = ", ".join([*(k for k in value if k != "surface"), "surface.…"])
             raise UserError(f"--set {text}: expected FIELD=JSON, FIELD one of {known}")
-        target[name] = value_of(given)
+        target[name] = value_of(literal)
     return _checked(value, f"--set {' '.join(texts)}")
 
 

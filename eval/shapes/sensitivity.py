@@ -63,7 +63,7 @@ _DEPENDS_ON = {
 
 def variants(protocol: GeometryProtocol) -> dict[str, GeometryProtocol]:
     """Return the protocols to compare by label: the chosen one, its changes, the named ones."""
-    found = {CHOSEN: protocol}
+    protocols = {CHOSEN: protocol}
     for field, values in _CHANGES.items():
         inner, _, name = field.rpartition(".")
         for value in values:
@@ -73,12 +73,12 @@ def variants(protocol: GeometryProtocol) -> dict[str, GeometryProtocol]:
                 changed = replace(protocol, **{name: value})
             if changed != protocol:
                 shown = "+".join(value) or "none" if isinstance(value, tuple) else str(value)
-                found[f"{field} = {shown}"] = changed
+                protocols[f"{field} = {shown}"] = changed
     of_files = {name: getattr(protocol, name) for name in _FILE_FIELDS}
     named: dict[GeometryProtocol, list[str]] = {}
     for name, preset in PRESETS.items():
         named.setdefault(replace(preset, name="", **of_files), []).append(name)
-    return found | {f"protocol {', '.join(names)}": p for p, names in named.items()}
+    return protocols | {f"protocol {', '.join(names)}": p for p, names in named.items()}
 
 
 def evaluate_variants(
@@ -110,12 +110,12 @@ def evaluate_variants(
         raise UserError(f"no object could be evaluated: {reasons}")
     rows = {}
     for label, chosen in protocols.items():
-        found = [record[label] for record in done if "failed" not in record[label]]
+        figures = [record[label] for record in done if "failed" not in record[label]]
         rows[label] = {
-            "objects": len(found),
+            "objects": len(figures),
             "thresholds": list(chosen.thresholds),
             "unit": chosen.unit,
-            "mean": mean_of(found),
+            "mean": mean_of(figures),
         }
     page = _page(rows, len(done))
     if folder is not None:
@@ -158,17 +158,17 @@ def vary_pair(
             known[key] = function(*arguments)
         return known[key]
 
-    found: dict[str, dict[str, Any]] = {}
+    figures: dict[str, dict[str, Any]] = {}
     for label, chosen in protocols.items():
         try:
             loaded = once(load_prediction, pair.pred, transform or gt.transform, axes, chosen)
             moved, _ = once(align_shape, loaded.shape, gt.shape, chosen)
             metrics = once(point_metrics, moved, gt.shape, chosen)
             metrics = metrics | once(shape_iou, moved, gt.shape, chosen)
-            found[label] = check_finite(_row_figures(metrics, chosen))
+            figures[label] = check_finite(_row_figures(metrics, chosen))
         except UserError as error:
-            found[label] = {"failed": str(error)}
-    return {"name": pair.name, "status": OK, "variants": found}
+            figures[label] = {"failed": str(error)}
+    return {"name": pair.name, "status": OK, "variants": figures}
 
 
 def _row_figures(metrics: dict[str, Any], protocol: GeometryProtocol) -> dict[str, Any]:

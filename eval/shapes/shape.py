@@ -249,10 +249,10 @@ def nearest(queries: Points, points: Points) -> tuple[np.ndarray, np.ndarray]:
         Distances ``[N]`` float32 and indices ``[N]``.
     """
     order, positions = queries._sorted
-    found, squared = points._tree.knn_search(positions, 1)
+    ranks, squared = points._tree.knn_search(positions, 1)
     distances, indices = np.empty(len(order), np.float32), np.empty(len(order), np.int64)
     distances[order] = np.sqrt(squared.numpy()[:, 0])
-    indices[order] = points._sorted[0][found.numpy()[:, 0]]
+    indices[order] = points._sorted[0][ranks.numpy()[:, 0]]
     return distances, indices
 
 

@@ -44,9 +44,9 @@ def _draw_mesh(mesh: Any, viewmat: np.ndarray, K: np.ndarray) -> np.ndarray:
     directions = pixels @ np.linalg.inv(K).T @ viewmat[:3, :3]
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
     origins = np.broadcast_to(-viewmat[:3, :3].T @ viewmat[:3, 3], directions.shape)
-    found = mesh.scene().cast_rays(np.hstack([origins, directions]).astype(np.float32))
-    facing = np.abs((found["primitive_normals"].numpy() * directions).sum(1))
-    shade = np.where(np.isfinite(found["t_hit"].numpy()), 40 + 170 * facing, 255)
+    hits = mesh.scene().cast_rays(np.hstack([origins, directions]).astype(np.float32))
+    facing = np.abs((hits["primitive_normals"].numpy() * directions).sum(1))
+    shade = np.where(np.isfinite(hits["t_hit"].numpy()), 40 + 170 * facing, 255)
     return shade.reshape(SIDE, SIDE).astype(np.uint8)
 
 

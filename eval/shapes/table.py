@@ -29,8 +29,8 @@ def page(report: dict[str, Any]) -> str:
     thresholds = sorted(report["protocol"]["thresholds"])
     middle = thresholds[len(thresholds) // 2]
     columns = _SHOWN | {f"fscore.{middle:g}": Column(f"F-score at {middle:g}", 4)}
-    found = {key: flat(report[key], lists=True) for key in ("mean", "interval", "median")}
-    shown = {key: {kind: values.get(key) for kind, values in found.items()} for key in columns}
+    statistics = {key: flat(report[key], lists=True) for key in ("mean", "interval", "median")}
+    shown = {key: {kind: values.get(key) for kind, values in statistics.items()} for key in columns}
     count = str(report["num_ok"])
     means, medians = (
         figures(["", "objects"], columns, [Row([of, count], shown)], of)
@@ -78,11 +78,11 @@ def summaries(objects: list[dict[str, Any]]) -> dict[str, Any]:
 
 def file_warnings(done: list[dict[str, Any]]) -> list[str]:
     """Return each warning of the evaluated files, with the number of files."""
-    found = []
+    warnings = []
     for key, name in (("gt_warnings", "ground truths"), ("pred_warnings", "predictions")):
         counts = Counter(text for record in done for text in record.get(key, ()))
-        found += [f"{count} of {len(done)} {name}: {text}" for text, count in counts.items()]
-    return found
+        warnings += [f"{count} of {len(done)} {name}: {text}" for text, count in counts.items()]
+    return warnings
 
 
 def rotation_warnings(done: list[dict[str, Any]]) -> list[str]:
@@ -114,14 +114,14 @@ def rotation_warnings(done: list[dict[str, Any]]) -> list[str]:
                 f"the mean Chamfer distance of {len(done)} predictions would be {value:.3g} "
                 f"in place of {straight:.3g} if all were {turn}; {ask(turn)}"
             ]
-    found: dict[str, list[str]] = {}
+    by_turn: dict[str, list[str]] = {}
     for record in done:
         straight, turn, value = straight_and_best(record["chamfer_turned"])
         if value < FAR_BETTER * straight:
             text = f"{record['name']} {value:.3g} in place of {straight:.3g}"
-            found.setdefault(turn, []).append(text)
+            by_turn.setdefault(turn, []).append(text)
     return [
         f"{len(texts)} of {len(done)} predictions would have a far smaller Chamfer distance {turn} "
         f"({'; '.join(texts[:_NAMED])}{'; ...' if len(texts) > _NAMED else ''}); {ask(turn)}"
-        for turn, texts in found.items()
+        for turn, texts in by_turn.items()
     ]

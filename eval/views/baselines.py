@@ -124,18 +124,18 @@ class Retrieval:
         self.failures: dict[str, str] = {}
         self.found: dict[str, NearestView] = {}
         self._sources: list[tuple[str, int]] = []  # (uid, view) of each thumbnail
-        found = []
+        quantized = []
         for uid in progress_bar(training.uids, desc="retrieval index", unit="object"):
             try:
                 small = thumbnails(training.load(uid, size=THUMBNAIL).images)
             except UserError as error:
                 self.failures[uid] = str(error)
                 continue
-            found.append((255 * small).round().byte())
+            quantized.append((255 * small).round().byte())
             self._sources += [(uid, view) for view in range(len(small))]
-        if not found:
+        if not quantized:
             raise UserError("no training object can be read")
-        self._thumbnails = torch.cat(found)  # [M, THUMBNAIL², 4]; 8 bits: 4 kB a view
+        self._thumbnails = torch.cat(quantized)  # [M, THUMBNAIL², 4]; 8 bits: 4 kB a view
         self._alphas = self._thumbnails[..., 3].float() / 255
         self._areas = self._alphas.sum(1)
 
@@ -170,11 +170,11 @@ class Retrieval:
 
     def __call__(self, gt: GroundTruth) -> Shown | None:
         """Return the images; None without another object. Raises UserError for a bad image."""
-        found = self.nearest(gt.images[0].cpu(), gt.uid)
-        if found is None:
+        nearest = self.nearest(gt.images[0].cpu(), gt.uid)
+        if nearest is None:
             return None
-        self.found[gt.uid] = found
-        uid, view, _ = found
+        self.found[gt.uid] = nearest
+        uid, view, _ = nearest
         poses = torch.from_numpy(self.training.files(uid).camera_to_world)
         viewmats = from_opengl(poses).double()
         relative, _ = relative_to_reference(viewmats, viewmats[view])

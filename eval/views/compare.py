@@ -191,14 +191,14 @@ def compare(candidates: Mapping[str, Shown], gt: GroundTruth) -> dict[str, list[
     result: dict[str, list[Values]] = {}
     for name, images in candidates.items():
         alpha, mask = images.alpha, images.mask()
-        found = measure(
+        measured = measure(
             lambda grey, shown=images: (shown.on(grey), gt.shown.on(grey)),
             None if mask is None else (mask, gt.mask),
             [k for k, m in all_figures().items() if alpha is not None or m.ground is None],
         )
         values = dict.fromkeys(all_figures(), [None] * len(images.rgb))
-        values |= {key: figures.tolist() for key, figures in found.items()}
-        values["mse"] = (10 ** (-found["psnr"] / 10)).tolist()
+        values |= {key: figures.tolist() for key, figures in measured.items()}
+        values["mse"] = (10 ** (-measured["psnr"] / 10)).tolist()
         result[name] = [dict(zip(values, row)) for row in zip(*values.values())]
     return result
 
@@ -232,8 +232,8 @@ def add_lpips(
                 part = slice(start, start + BATCH)
                 features = lpips.features(true[part])
                 for name, rgb in shown.items():
-                    found = fixed[name] if name in fixed else lpips.features(rgb[part])
-                    distances = lpips.distance(found, features).tolist()
+                    candidate = fixed[name] if name in fixed else lpips.features(rgb[part])
+                    distances = lpips.distance(candidate, features).tolist()
                     for row, value in zip(values[name][part], distances):
                         row[key] = value
                 bar.update()

@@ -188,8 +188,8 @@ def _check_outputs(options: ViewsOptions, uids: list[str]) -> None:
     if options.out is None:
         return
     if options.save_images:
-        made = (options.out / "images").resolve()
-        if made in (options.checkpoint.resolve(), *options.checkpoint.resolve().parents):
+        folder = (options.out / "images").resolve()
+        if folder in (options.checkpoint.resolve(), *options.checkpoint.resolve().parents):
             raise UserError(f"{options.checkpoint}: would be overwritten; give another --out")
     targets = [options.out / "strips" / f"{uid}.png" for uid in uids[: options.strips]]
     for name in ("gaussians", "retrieval"):
@@ -307,7 +307,7 @@ def evaluate_object(job: Job, uid: str, folders: Mapping[str, Path] = {}) -> dic
             add_lpips(by_view, candidates, gt, job.network)
     if not images.has_input:
         by_view[""][0] = dict.fromkeys(by_view[""][0])
-    found = job.retrieval.found.get(uid) if job.retrieval else None
+    nearest = job.retrieval.found.get(uid) if job.retrieval else None
     gaussians = predicted if isinstance(predicted, Gaussians) else None
 
     if "strips" in folders:
@@ -321,9 +321,9 @@ def evaluate_object(job: Job, uid: str, folders: Mapping[str, Path] = {}) -> dic
         for name, candidate in (model | baselines).items():
             where = folders["images"] / name / uid
             save_images(where, job.dataset.files(uid), gt.views, candidate)
-    if "retrieval" in folders and found and job.meshes:
+    if "retrieval" in folders and nearest and job.meshes:
         try:
-            job.meshes.save(folders["retrieval"] / f"{uid}.ply", found, job.protocol.distance)
+            job.meshes.save(folders["retrieval"] / f"{uid}.ply", nearest, job.protocol.distance)
         except ERRORS as error:
             job.fail(f"{uid} (retrieval's mesh)", error)
 
@@ -333,7 +333,7 @@ def evaluate_object(job: Job, uid: str, folders: Mapping[str, Path] = {}) -> dic
         "status": OK,
         **summaries.pop(""),
         "baselines": summaries,
-        **({"retrieval": found._asdict()} if found else {}),
+        **({"retrieval": nearest._asdict()} if nearest else {}),
         "views": gt.views,
         "coverage": gt.coverage,
         "num_nearly_empty": sum(fraction < NEARLY_EMPTY for fraction in gt.coverage),
@@ -362,12 +362,12 @@ def sheet_rows(job: Job, records: list[dict[str, Any]], each: int) -> list[Row]:
         record = done[rank]
         try:
             gt = load_gt(job.dataset, record["name"], job.protocol, job.device)
-            made = images_of(job.predict(gt), gt).shown
+            shown = images_of(job.predict(gt), gt).shown
         except ERRORS:  # a file changed meanwhile; the report has its record
             continue
         views = choose_views(len(gt.rgb), 0, SHEET_VIEWS + 1)[1:]
-        ground = WHITE if made.alpha is None else GREY
-        true, got = gt.shown.on(ground), made.on(ground)
+        ground = WHITE if shown.alpha is None else GREY
+        true, got = gt.shown.on(ground), shown.on(ground)
         lines = label(record, f"{group}: {rank + 1} of {len(done)}")
         rows.append(Row(lines, true[0], true[views], got[views]))
     return rows

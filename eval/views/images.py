@@ -105,30 +105,30 @@ class ImagePredictions:
             raise UserError(f"{folder}: no such folder")
         files, views = dataset.files(gt.uid), gt.views
         if (folder / TRANSFORMS).is_file():
-            by, found, given = "camera", *_match_by_camera(folder, files, views)
+            by, paths, count = "camera", *_match_by_camera(folder, files, views)
         else:
-            by, found, given = _match_by_name(folder, files, views)
-        lacking = [view for view in views[1:] if view not in found]
-        if lacking or not found:
+            by, paths, count = _match_by_name(folder, files, views)
+        lacking = [view for view in views[1:] if view not in paths]
+        if lacking or not paths:
             raise UserError(_missing_message(folder, lacking or views, views, by))
         rgba = torch.zeros(len(views), *gt.rgb.shape[1:3], 4)
-        there = [view in found for view in views]
+        there = [view in paths for view in views]
         alphas, resized = {}, 0
         for row, view in enumerate(views):
-            if view in found:
-                with open_image(found[view]) as file:
+            if view in paths:
+                with open_image(paths[view]) as file:
                     alphas[view] = file.has_transparency_data
-                image = load_rgba8(found[view])
-                fitted = self._resized(found[view], image, gt, files, view)
+                image = load_rgba8(paths[view])
+                fitted = self._resized(paths[view], image, gt, files, view)
                 resized += fitted is not image
                 rgba[row] = torch.from_numpy(fitted.astype(np.float32) / 255)
         if len(set(alphas.values())) > 1:
             odd = next(view for view, alpha in alphas.items() if not alpha)
-            raise UserError(f"{found[odd]}: has no alpha, but others of the object have")
+            raise UserError(f"{paths[odd]}: has no alpha, but others of the object have")
         opaque = bool((rgba[there, ..., 3] == 1).all())
         if opaque:
             _check_white(folder, rgba[..., :3], gt, there)
-        unused = given - len(found)
+        unused = count - len(paths)
         record = {"matched_by": by, "unused": unused, "resized": resized, "alpha": not opaque}
         images = shown(rgba.to(self.device))
         if opaque:
@@ -176,12 +176,12 @@ def _match_by_camera(
         UserError: the cameras cannot be read, or a view matches two or none; the message gives the
             distance of the nearest.
     """
-    given = LAYOUTS["transforms"][1](folder)
-    intrinsics = np.stack([_intrinsics(given, i) for i in range(len(given.images))])
-    found, far = {}, {}
+    listed = LAYOUTS["transforms"][1](folder)
+    intrinsics = np.stack([_intrinsics(listed, i) for i in range(len(listed.images))])
+    paths, far = {}, {}
     for view in views:
         # The Frobenius norm of R - R' is sqrt(8) sin(angle / 2), accurate for small angles too.
-        poses, pose = given.camera_to_world, files.camera_to_world[view]
+        poses, pose = listed.camera_to_world, files.camera_to_world[view]
         chord = np.linalg.norm(poses[:, :3, :3] - pose[:3, :3], axis=(1, 2)) / np.sqrt(8)
         angle = 2 * np.arcsin(np.clip(chord, 0, 1))
         shift = np.linalg.norm(poses[:, :3, 3] - pose[:3, 3], axis=1) / np.linalg.norm(pose[:3, 3])
@@ -189,10 +189,10 @@ def _match_by_camera(
         off = np.stack([angle, shift, np.abs(intrinsics - _intrinsics(files, view)).max(1)], 1)
         near = np.flatnonzero((off <= CAMERA).all(1))
         if len(near) > 1:
-            names = " and ".join(given.images[i].name for i in near[:2])
+            names = " and ".join(listed.images[i].name for i in near[:2])
             raise UserError(f"{folder}: {names} both have the camera of view {view}")
         if len(near):
-            found[view] = given.images[near[0]]
+            paths[view] = listed.images[near[0]]
         else:
             far[view] = off[off[:, :2].sum(1).argmin()]
     lacking = [view for view in views[1:] if view in far]
@@ -204,7 +204,7 @@ def _match_by_camera(
             f"moved by {move:.3g} of the distance, and "
             f"its intrinsics differ by {difference:.3g} of the image"
         )
-    return found, len(given.images)
+    return paths, len(listed.images)
 
 
 def _intrinsics(files: ObjectFiles, view: int) -> np.ndarray:
@@ -222,19 +222,19 @@ def _match_by_name(
     Raises:
         UserError: two images match one view.
     """
-    given: dict[str, Path] = {}
+    by_stem: dict[str, Path] = {}
     for path in sorted(filter(_is_image, folder.iterdir())):
-        if not path.name.startswith(".") and given.setdefault(path.stem, path) is not path:
-            raise UserError(f"{path}: {given[path.stem].name} has the same name; keep one")
+        if not path.name.startswith(".") and by_stem.setdefault(path.stem, path) is not path:
+            raise UserError(f"{path}: {by_stem[path.stem].name} has the same name; keep one")
     stems = [path.stem for path in files.images]
-    if len(set(stems)) == len(stems) and set(stems) & set(given):
-        found = {view: given[stems[view]] for view in views if stems[view] in given}
-        return "name", found, len(given)
-    numbers: dict[int, Path] = {}
-    for stem, path in given.items():
-        if stem.isascii() and stem.isdigit() and numbers.setdefault(int(stem), path) is not path:
-            raise UserError(f"{path}: {numbers[int(stem)].name} has the same number; keep one")
-    return "number", {view: numbers[view] for view in views if view in numbers}, len(given)
+    if len(set(stems)) == len(stems) and set(stems) & set(by_stem):
+        paths = {view: by_stem[stems[view]] for view in views if stems[view] in by_stem}
+        return "name", paths, len(by_stem)
+    by_number: dict[int, Path] = {}
+    for stem, path in by_stem.items():
+        if stem.isascii() and stem.isdigit() and by_number.setdefault(int(stem), path) is not path:
+            raise UserError(f"{path}: {by_number[int(stem)].name} has the same number; keep one")
+    return "number", {view: by_number[view] for view in views if view in by_number}, len(by_stem)
 
 
 def _missing_message(folder: Path, lacking: Sequence[int], views: Sequence[int], by: str) -> str:
@@ -249,7 +249,7 @@ def _missing_message(folder: Path, lacking: Sequence[int], views: Sequence[int],
     )
 
 
-def _check_white(folder: Path, rgb: Tensor, gt: GroundTruth, found: list[bool]) -> None:
+def _check_white(folder: Path, rgb: Tensor, gt: GroundTruth, there: list[bool]) -> None:
     """Refuse opaque images on a flat background that is not white.
 
     Fog is not flat, so it still counts against the method.
@@ -257,7 +257,7 @@ def _check_white(folder: Path, rgb: Tensor, gt: GroundTruth, found: list[bool]) 
     Raises:
         UserError: over half of the empty pixels of the true images have one such colour.
     """
-    empty = (gt.images[..., 3] == 0).cpu() & torch.tensor(found)[:, None, None]
+    empty = (gt.images[..., 3] == 0).cpu() & torch.tensor(there)[:, None, None]
     pixels = rgb[empty]
     if not len(pixels):
         return

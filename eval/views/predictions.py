@@ -112,16 +112,16 @@ def open_predictions(options: ViewsOptions, device: str, size: int | None = None
     if not path.exists():
         raise UserError(f"{path}: no such checkpoint, folder of .ply files or of images")
     if path.is_dir() and next(visible(path, "*.ply"), None) is not None:
-        found = PlyPredictions(path, options.distance, device)
+        predictions = PlyPredictions(path, options.distance, device)
     elif path.is_dir() and next(path.glob("*.safetensors"), None) is None:
         if not holds_images(path):
             raise UserError(
                 f"{path}: holds neither .ply files nor folders of images nor a checkpoint"
             )
-        found = ImagePredictions(path, options.distance, device, options.resize_images)
+        predictions = ImagePredictions(path, options.distance, device, options.resize_images)
     else:
         return ModelPredictions(options, device, size)
     for name in ("background_margin", "precision", "detail"):
         if getattr(options, name) != getattr(ViewsOptions, name):
             raise UserError(f"{option(name)}: {path} holds no model")
-    return found
+    return predictions

@@ -158,10 +158,10 @@ class Actions:
     @page_errors()
     def load_example(self, event: gr.EventData, request: gr.Request) -> tuple:
         """Take an example of the gallery."""
-        found, index = examples(), event._data["index"]
-        if type(index) is not int or not 0 <= index < len(found):
-            raise UserError(f"not one of the {len(found)} examples")
-        path, title = found[index]
+        shipped, index = examples(), event._data["index"]
+        if type(index) is not int or not 0 <= index < len(shipped):
+            raise UserError(f"not one of the {len(shipped)} examples")
+        path, title = shipped[index]
         cut = self._call(request, cut_image, path, title, self._options)
         return *self._shown(cut, request), str(path)
 
@@ -218,10 +218,10 @@ class Actions:
         progress(0.1, "Running the network")
         earlier = [each.made.chosen for each in results if each.made.given == after.key]
         chosen = earlier[-1] if earlier else None
-        made = self._call(request, work.run_model, self._model, after, chosen)
+        reconstruction = self._call(request, work.run_model, self._model, after, chosen)
         progress(0.8, "Making the viewer")
         edited = (gr.skip(),) * 4 if after is before else self._edited(after, request)
-        return *edited, *self._added(results, made, request)
+        return *edited, *self._added(results, reconstruction, request)
 
     def take_all(
         self,
@@ -240,7 +240,7 @@ class Actions:
                 progress(number / len(given), f"Image {number + 1} of {len(given)}")
                 try:
                     cut = self._call(request, cut_image, Path(file["path"]), name, self._options)
-                    made = self._call(request, work.run_model, self._model, cut)
+                    reconstruction = self._call(request, work.run_model, self._model, cut)
                 except Cancelled:
                     raise
                 except UserError as error:
@@ -249,7 +249,7 @@ class Actions:
                     continue
                 if cut.warning:
                     doubted.append(name)
-                results, *shown = self._added(results, made, request)
+                results, *shown = self._added(results, reconstruction, request)
                 yield gr.update(open=False), results, *shown
             if doubted:
                 text = f"{', '.join(doubted)}. Give such an image alone to correct it."
@@ -270,14 +270,14 @@ class Actions:
     def edit(self, message: dict[str, Any], results: list[Result], state: State | None) -> Any:
         """Edit one of the results; files of the shown one that were written before are dropped."""
         try:
-            told = msgspec.convert(message, Edit)
+            edit = msgspec.convert(message, Edit)
         except msgspec.ValidationError as error:
             raise UserError(f"the edit: {error}") from None
-        made = next((each.made for each in results if each.made.key == told.key), None)
-        if made is None:
+        reconstruction = next((each.made for each in results if each.made.key == edit.key), None)
+        if reconstruction is None:
             raise UserError("this result has expired")
-        work.edit(made, told.elevation, told.removed)
-        if state is None or state[0] is not made:
+        work.edit(reconstruction, edit.elevation, edit.removed)
+        if state is None or state[0] is not reconstruction:
             return gr.skip()
         state[1].clear()
         return gr.update(value=None, visible=False)
@@ -293,8 +293,8 @@ class Actions:
             request: gr.Request,
             progress: gr.Progress = gr.Progress(),  # noqa: B008
         ) -> tuple:
-            made, files = _state(state)
-            one = copy.copy(made)  # the object may be edited meanwhile
+            reconstruction, files = _state(state)
+            one = copy.copy(reconstruction)  # the object may be edited meanwhile
             progress(0.1, f"Writing {work.KINDS[kind][1]}")
             mesh = work.MeshChoice.of(faces, texture, watertight)
             inputs = one, kind, self._store.new_folder(), self._device, mesh
@@ -307,26 +307,26 @@ class Actions:
             # In place: meanwhile the page may show another object, which stays.
             files[:] = [*(old for old in files if old.name != path.name and old.is_file()), path]
             listed = gr.update(value=[str(file) for file in files], visible=True)
-            if made.removed is not one.removed or made.surface is one.surface:
+            if reconstruction.removed is not one.removed or reconstruction.surface is one.surface:
                 return listed, gr.skip()
-            made.surface, made.choice = one.surface, one.choice
-            return listed, _frame(made)
+            reconstruction.surface, reconstruction.choice = one.surface, one.choice
+            return listed, _frame(reconstruction)
 
         return page_errors()(write)
 
     def _added(
-        self, results: list[Result], made: work.EditableObject, request: gr.Request
+        self, results: list[Result], reconstruction: work.EditableObject, request: gr.Request
     ) -> tuple:
         """Append a result, and show it."""
         path = self._store.new_folder() / "result.png"
-        self._call(request, work.thumbnail, made, path, self._device)
+        self._call(request, work.thumbnail, reconstruction, path, self._device)
         _forget_surfaces(results)
-        kept = [*results, Result(made, path)][-MAX_IMAGES:]
-        if len(kept) == len(results):
+        latest = [*results, Result(reconstruction, path)][-MAX_IMAGES:]
+        if len(latest) == len(results):
             gr.Info(f"The strip keeps the last {MAX_IMAGES} results.")
-        strip = [(str(result.image), result.made.name) for result in kept]
-        shown = gr.update(value=strip, visible=len(kept) > 1, selected_index=None)
-        return kept, shown, *_presented(made)
+        strip = [(str(result.image), result.made.name) for result in latest]
+        shown = gr.update(value=strip, visible=len(latest) > 1, selected_index=None)
+        return latest, shown, *_presented(reconstruction)
 
     def _call(
         self,
@@ -383,17 +383,17 @@ def _forget_surfaces(results: list[Result]) -> None:
         result.made.surface = None
 
 
-def _presented(made: work.EditableObject) -> tuple:
+def _presented(reconstruction: work.EditableObject) -> tuple:
     """Return state, viewer, the buttons of files, no files, the view, and the elevation."""
     files, on = gr.update(value=None, visible=False), gr.update(visible=True)
-    info = f"Estimate: {made.estimate}. Change it if the object leans."
-    elevation = gr.update(value=made.view.elevation, info=info)
-    return (made, []), _frame(made), on, files, VIEWS[1], elevation
+    info = f"Estimate: {reconstruction.estimate}. Change it if the object leans."
+    elevation = gr.update(value=reconstruction.view.elevation, info=info)
+    return (reconstruction, []), _frame(reconstruction), on, files, VIEWS[1], elevation
 
 
-def _frame(made: work.EditableObject) -> str:
-    document = html.escape(work.viewer(made), quote=True)
-    return _FRAME.format(name=html.escape(made.name, quote=True), document=document)
+def _frame(reconstruction: work.EditableObject) -> str:
+    document = html.escape(work.viewer(reconstruction), quote=True)
+    return _FRAME.format(name=html.escape(reconstruction.name, quote=True), document=document)
 
 
 def _state(state: State | None) -> State:

@@ -104,8 +104,8 @@ def cut_image(path: Path, name: str, options: CutoutOptions) -> Cut:
     if cut.doubt:
         label = _network(options) if cut.method in ("plain", "grabcut") else ""
         note += f" {cut.doubt} Paint what to keep or remove{', or use a network' if label else ''}."
-    found = cut.rgba, ghost, note, cut.doubt, cut.areas, path, label
-    return Cut(stem(name), rgb, cut.mask, cut.mask, *found)
+    fields = cut.rgba, ghost, note, cut.doubt, cut.areas, path, label
+    return Cut(stem(name), rgb, cut.mask, cut.mask, *fields)
 
 
 def _network(options: CutoutOptions) -> str:
@@ -144,16 +144,16 @@ def cut_by_network(cut: Cut, options: CutoutOptions) -> Cut:
     return replace(again, key=cut.key)
 
 
-def _clean_edge(rgb: np.ndarray, mask: np.ndarray, found: np.ndarray) -> np.ndarray:
+def _clean_edge(rgb: np.ndarray, mask: np.ndarray, cutout: np.ndarray) -> np.ndarray:
     """Return the image with the found object's edge colours, so that strokes leave no fringe."""
     from ..data.preprocess import PRESENT
 
     present = mask > PRESENT
     rows, columns = np.flatnonzero(present.any(1)), np.flatnonzero(present.any(0))
     box = slice(rows[0], rows[-1] + 1), slice(columns[0], columns[-1] + 1)
-    top, left = ((found.shape[0] - size) // 2 for size in mask[box].shape)
+    top, left = ((cutout.shape[0] - size) // 2 for size in mask[box].shape)
     height, width = mask[box].shape
-    inner = found[top : top + height, left : left + width]
+    inner = cutout[top : top + height, left : left + width]
     out = rgb.copy()
     out[box] = np.where(present[box][..., None], inner[..., :3], rgb[box])
     return out
@@ -288,9 +288,9 @@ def examples() -> list[tuple[Path, str]]:
 
     An installed package has two, a checkout more.
     """
-    found = []
+    images = []
     for path in sorted(FOLDER.glob("*.png")):
         # ``scopia-dog-house`` becomes "dog house": the author comes first.
         title = re.sub("^(blendswap-cc-(0|by)|katorlegaz|scopia)-", "", path.stem)
-        found.append((path, re.sub("[-_]", " ", title.rstrip("0123456789"))))
-    return found
+        images.append((path, re.sub("[-_]", " ", title.rstrip("0123456789"))))
+    return images

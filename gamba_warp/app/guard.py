@@ -47,19 +47,19 @@ def is_foreign(method: str, headers: Iterable[tuple[str, str]]) -> bool:
         method: of the request, such as GET.
         headers: all of the request, by name.
     """
-    found: dict[str, str] = {}
+    by_name: dict[str, str] = {}
     for name, value in ((name.lower(), value) for name, value in headers):
-        if name in found and name in _CHECKED:
+        if name in by_name and name in _CHECKED:
             return True
-        found[name] = value
-    host, site = found.get("host", ""), found.get("sec-fetch-site")
+        by_name[name] = value
+    host, site = by_name.get("host", ""), by_name.get("sec-fetch-site")
     name, colon, port = host.partition(":")
     if name not in _HOSTS or (colon and not port.isdecimal()):
         return True
-    if found.get("origin") not in (None, f"http://{host}"):
+    if by_name.get("origin") not in (None, f"http://{host}"):
         return True
     # The page of a link sees no answer; a form of another page, without an Origin, would act.
-    followed = found.get("sec-fetch-mode") == "navigate" and method in ("GET", "HEAD")
+    followed = by_name.get("sec-fetch-mode") == "navigate" and method in ("GET", "HEAD")
     return not followed and site not in (None, "none", "same-origin")
 
 
@@ -105,5 +105,5 @@ class Guard:
             return PlainTextResponse("open the address that gamba app has printed\n", 403)
         return None
 
-    def _is_token(self, given: str | None) -> bool:
-        return compare_digest((given or "").encode(), self._token.encode())
+    def _is_token(self, token: str | None) -> bool:
+        return compare_digest((token or "").encode(), self._token.encode())

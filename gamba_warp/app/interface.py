@@ -57,7 +57,7 @@ def build(actions: Actions) -> gr.Blocks:
         with gr.Row(elem_id="now"):
             status = gr.HTML(elem_id="status")
             cancel = gr.Button("Cancel", size="sm", min_width=80, elem_id="cancel")
-        cut, made, results = (
+        cut, state, results = (
             gr.State(first, time_to_live=KEEP_SECONDS) for first in (None, None, [])
         )
         small_images: dict[str, Any] = {
@@ -188,7 +188,7 @@ def build(actions: Actions) -> gr.Blocks:
         brush.change(_painting, brush, editor, show_progress="hidden", **free)
         mend.click(actions.apply_strokes, mask[:2], mask, **one)
         restart.click(actions.restart, cut, mask, **one)
-        seen = [made, stage, files_part, made_files, view, elevation]
+        seen = [state, stage, files_part, made_files, view, elevation]
         added = [results, strip, *seen]
         make.click(actions.reconstruct, [cut, editor, results], [*mask, *added], **one)
         several.upload(actions.take_all, [several, results], [more, *added], **one)
@@ -197,7 +197,7 @@ def build(actions: Actions) -> gr.Blocks:
             # A file that needs no rendering does not wait for the device.
             queue = {**shared, "concurrency_id": "files"} if kind in work.UNRENDERED else one
             written = button.click(
-                actions.writer(kind), [made, faces, texture, closed], [made_files, stage], **queue
+                actions.writer(kind), [state, faces, texture, closed], [made_files, stage], **queue
             )
             written.success(None, made_files, None, js=_FETCH, api_visibility="private")
         areas.click(actions.toggle_holes, cut, mask, **one)
@@ -205,7 +205,7 @@ def build(actions: Actions) -> gr.Blocks:
         # Like the files, so that a file that is asked for afterwards has the edit.
         edits.submit(
             actions.edit,
-            [edits, results, made],
+            [edits, results, state],
             made_files,
             trigger_mode="always_last",
             show_progress="hidden",

@@ -98,12 +98,12 @@ def work_folder() -> Iterator[Path]:
 def _remove_leftover(folder: Path) -> None:
     """Remove a folder that an ended ``gamba app`` of this user left, and no other."""
     try:
-        made = folder.lstat()
+        status = folder.lstat()
     except OSError:  # removed meanwhile
         return
     # Other users may create a folder or link of this name.
-    ours = made.st_uid == os.geteuid() and not made.st_mode & 0o077
-    if not (stat.S_ISDIR(made.st_mode) and ours):
+    ours = status.st_uid == os.geteuid() and not status.st_mode & 0o077
+    if not (stat.S_ISDIR(status.st_mode) and ours):
         return
     if not (folder / ".lock").is_file():  # another process is creating it
         return

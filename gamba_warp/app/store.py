@@ -28,13 +28,13 @@ class Store:
         return Path(tempfile.mkdtemp(dir=self._folder))
 
     def _remove_oldest(self) -> None:
-        found = []
+        files = []
         for path in self._folder.glob("*/*"):
             with suppress(FileNotFoundError):  # renamed by its writer
                 state = path.lstat()
-                found.append((state.st_mtime, state.st_size, path))
-        total = sum(size for _, size, _ in found)
-        for _, size, path in sorted(found):
+                files.append((state.st_mtime, state.st_size, path))
+        total = sum(size for _, size, _ in files)
+        for _, size, path in sorted(files):
             if total <= self._limit:
                 return
             total -= size

@@ -114,9 +114,9 @@ def run_model(model: Gamba, cut: Cut, elevation: float | None = None) -> Editabl
         UserError: also if the mask is empty.
     """
     rgba = model_image(cut)
-    found = reconstruct_object(model, cut.name, rgba, elevation)
+    reconstruction = reconstruct_object(model, cut.name, rgba, elevation)
     small = to_uint8(shrink(rgba, _IMAGE))
-    return EditableObject(**vars(found), image=small, given=cut.key, chosen=elevation)
+    return EditableObject(**vars(reconstruction), image=small, given=cut.key, chosen=elevation)
 
 
 def surface_of(
@@ -133,15 +133,15 @@ def surface_of(
     Raises:
         UserError: there is none, or a library is missing.
     """
-    kept, choice = made.surface, (mesh.faces, mesh.watertight)
-    baked = 0 if kept is None or kept.texture is None else len(kept.texture.image)
-    if kept is None or made.choice != choice or texture not in (0, baked):
+    surface, choice = made.surface, (mesh.faces, mesh.watertight)
+    baked = 0 if surface is None or surface.texture is None else len(surface.texture.image)
+    if surface is None or made.choice != choice or texture not in (0, baked):
         options = SurfaceOptions(colors=True, faces=mesh.faces, watertight=mesh.watertight)
         options.require(texture)
         chosen = torch.device(device)
-        kept = extract.surface_of(made.kept, options, chosen, texture)
-        made.surface, made.choice = kept, choice
-    return kept
+        surface = extract.surface_of(made.kept, options, chosen, texture)
+        made.surface, made.choice = surface, choice
+    return surface
 
 
 def thumbnail(made: EditableObject, path: Path, device: str = "cpu") -> None:

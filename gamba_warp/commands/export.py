@@ -69,19 +69,19 @@ def export_command(
     if not outputs.suffixes():
         raise UserError("nothing to write: give --mesh, --splats, --page or --turntable")
     outputs.require()
-    found, failures = find_gaussians(inputs)
-    if not found:
+    paths, failures = find_gaussians(inputs)
+    if not paths:
         raise UserError("; ".join(f"{path}: {reason}" for path, reason in failures))
-    names = plan_outputs(found, outputs.suffixes(), files.out)
+    names = plan_outputs(paths, outputs.suffixes(), files.out)
     output_folder(files.out)
-    results = Results("file", len(found), files.out, failures)
+    results = Results("file", len(paths), files.out, failures)
 
     def one(name: str, path: Path) -> None:
-        found = read(path, drop_bad, Gaussians)
-        warn(path, found.warnings)
-        assert isinstance(found.shape, Gaussians)
-        item = Object(name=name, gaussians=found.shape, view=view, in_unit=True)
-        count, figures = outputs.write(item, found.comments)
+        content = read(path, drop_bad, Gaussians)
+        warn(path, content.warnings)
+        assert isinstance(content.shape, Gaussians)
+        item = Object(name=name, gaussians=content.shape, view=view, in_unit=True)
+        count, figures = outputs.write(item, content.comments)
         say(" ".join([f"{name}: {count}", *figures["notes"]]))
         results.made.append({"input": str(path), "name": name, **figures})
 

@@ -132,10 +132,10 @@ def reconstruct_command(
 
     def one(name: str, path: Path) -> None:
         STAGES.begin("cutting out")
-        cut, given = cut_out(path, options), _given(path)
-        say(f"{places[name] if len(names) > 1 else ''}{given}: {cut.how}")
+        cut, original = cut_out(path, options), _given(path)
+        say(f"{places[name] if len(names) > 1 else ''}{original}: {cut.how}")
         if cut.warning:
-            warn(given, [f"{cut.warning} --save-inputs writes the cut-out for an image editor."])
+            warn(original, [f"{cut.warning} --save-inputs writes the cut-out for an image editor."])
         STAGES.begin("network")
         result = reconstruct_object(model, name, cut.rgba, camera.elevation, precision, detail)
         estimate, between = result.estimate, None
@@ -147,7 +147,7 @@ def reconstruct_command(
         count, figures = outputs.write_result(result, cut)
         for line in (f"{name}: {count}", *figures["notes"]):
             say(line)
-        source = {"input": str(given), "name": name, "cutout": cut.how, "warning": cut.warning}
+        source = {"input": str(original), "name": name, "cutout": cut.how, "warning": cut.warning}
         results.made.append(source | {"elevation": elevation, "elevation_doubt": between} | figures)
 
     for_each(names, one, "reconstruct", "image", failures)
@@ -167,8 +167,8 @@ def _find_images(
         raise UserError(f"give at least one image or folder, such as {example or 'photo.png'}")
     if example and images == (Path("photo.png"),) and not images[0].exists():  # the pages' example
         raise UserError(f"photo.png: no such file; give an image of yours, or {example}")
-    given = [_standard_input() if str(path) == "-" else path for path in dict.fromkeys(images)]
-    paths, failures = find_images(given, recursive)
+    sources = [_standard_input() if str(path) == "-" else path for path in dict.fromkeys(images)]
+    paths, failures = find_images(sources, recursive)
     if mask is not None and len(paths) != 1:
         raise UserError(f"--mask goes with one image, {len(paths)} are given")
     if not paths:

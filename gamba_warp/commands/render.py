@@ -85,8 +85,8 @@ def render_command(
     film = Film(*plan, parse_background(background), depth)
     film.rate = film.rate if fps is None else fps
     if kind != "png" and (film.background is None or depth):
-        given = "--depth" if depth else "--background none"
-        raise UserError(f"{given} needs images: give --kind png")
+        flag = "--depth" if depth else "--background none"
+        raise UserError(f"{flag} needs images: give --kind png")
     files, failures = find_gaussians(inputs)
     if not files:
         raise UserError("; ".join(f"{path}: {reason}" for path, reason in failures))

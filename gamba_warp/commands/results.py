@@ -63,9 +63,9 @@ def reported(command: Callable[..., Results]) -> Callable[..., int]:
 
     @functools.wraps(command)
     def run(*args: Any, **options: Any) -> int:
-        given = inspect.signature(command).bind(*args, **options)
-        given.apply_defaults()
-        values, files = given.arguments, given.arguments.get("files")
+        bound = inspect.signature(command).bind(*args, **options)
+        bound.apply_defaults()
+        values, files = bound.arguments, bound.arguments.get("files")
         piped = (files.out if files else values["out"]) == STREAM
         inputs = next(iter(values.values()))
         several = isinstance(inputs, tuple) and (len(inputs) > 1 or any(x.is_dir() for x in inputs))
@@ -82,7 +82,7 @@ def reported(command: Callable[..., Results]) -> Callable[..., int]:
                     values["files"] = replace(files, out=folder, page=False, turntable="none")
                 elif folder:
                     values["out"] = folder / f"stdout.{values['kind'] or 'gif'}"
-                results = command(*given.args, **given.kwargs)
+                results = command(*bound.args, **bound.kwargs)
             results.out = STREAM if piped else results.out
             for item, reason in results.failures:
                 say(f"gamba: failed: {item}: {reason}", sys.stderr)
@@ -107,11 +107,11 @@ def _one_file() -> Iterator[Path]:
         raise UserError("--out -: the standard output is a terminal; redirect it to a file")
     with tempfile.TemporaryDirectory(prefix="gamba-") as folder:
         yield Path(folder)
-        made = sorted(Path(folder).iterdir())
-        if len(made) > 1:
-            names = ", ".join(path.name for path in made[:4])
-            raise UserError(f"--out - writes one file, but {len(made)} were made: {names}")
-        for path in made:
+        files = sorted(Path(folder).iterdir())
+        if len(files) > 1:
+            names = ", ".join(path.name for path in files[:4])
+            raise UserError(f"--out - writes one file, but {len(files)} were made: {names}")
+        for path in files:
             with open(path, "rb") as file:
                 shutil.copyfileobj(file, stdout.buffer)
             stdout.flush()

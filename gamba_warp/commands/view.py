@@ -58,14 +58,14 @@ def view_command(
     check_not_read([] if out is None else [out], [file] if mesh is None else [file, mesh])
     if out is not None and out.suffix.lower() not in (".html", ".htm"):
         raise UserError(f"--out {out}: the page is an .html file")
-    found = read(file, drop_bad)
-    if isinstance(found.shape, Cloud):
+    content = read(file, drop_bad)
+    if isinstance(content.shape, Cloud):
         raise UserError(f"{file}: contains points; gamba view shows Gaussians and meshes")
-    gaussians = found.shape if isinstance(found.shape, Gaussians) else None
+    gaussians = content.shape if isinstance(content.shape, Gaussians) else None
     if mesh is not None and gaussians is None:
         raise UserError(f"--mesh goes with Gaussians, {file} contains a mesh")
-    warn(file, found.warnings)
-    shown, surface = found if mesh is None else read(mesh, only=TexturedMesh), None
+    warn(file, content.warnings)
+    shown, surface = content if mesh is None else read(mesh, only=TexturedMesh), None
     if isinstance(shown.shape, TexturedMesh):
         surface = viewed_mesh(shown.shape, mesh_axes or shown.axes)
     if mesh is not None and gaussians is not None and surface is not None:

@@ -138,15 +138,15 @@ def about_model(checkpoint: Path) -> list[tuple[str, str]]:
 def _in_short(card: ModelCard) -> Iterator[tuple[str, str]]:
     """Yield the model's figures, each with the best baseline's."""
     names = {"novel": "new views", "input": "input view", "shape": "shape"}
-    for own in card.figures:
-        if own.name != "model":
+    for ours in card.figures:
+        if ours.name != "model":
             continue
-        others = [row for row in card.figures if row.views == own.views and row is not own]
-        if own.views == "input":
+        others = [row for row in card.figures if row.views == ours.views and row is not ours]
+        if ours.views == "input":
             others = []  # copying the input is trivial
-        found = []
+        texts = []
         for key, (name, digits) in METRICS.items():
-            value = getattr(own, key)
+            value = getattr(ours, key)
             if value is None:
                 continue
             metric = all_figures().get(key)
@@ -156,6 +156,6 @@ def _in_short(card: ModelCard) -> Iterator[tuple[str, str]]:
             name, bracket, unit = name.partition(" [")
             unit = f" {unit[:-1]}" if bracket else ""
             beside = f" ({best[1]} {best[0]:.{digits}f})" if best else ""
-            found.append(f"{name} {value.mean:.{digits}f}{unit}{beside}")
+            texts.append(f"{name} {value.mean:.{digits}f}{unit}{beside}")
         note = "; in brackets the best baseline" if others else ""
-        yield names[own.views], f"{', '.join(found)}{note}. {own.objects:,} objects."
+        yield names[ours.views], f"{', '.join(texts)}{note}. {ours.objects:,} objects."

@@ -95,10 +95,10 @@ def _image(image: np.ndarray, label: str, css: str = "", kind: str = "PNG") -> s
 def _animation(frames: np.ndarray, label: str) -> str:
     # WebP takes a third of a GIF's size and has no palette.
     content = io.BytesIO()
-    first, *rest = (Image.fromarray(frame) for frame in frames)
+    first, *later = (Image.fromarray(frame) for frame in frames)
     duration = round(1000 * SECONDS / len(frames))
     first.save(
-        content, "WEBP", save_all=True, append_images=rest, duration=duration, loop=0, quality=90
+        content, "WEBP", save_all=True, append_images=later, duration=duration, loop=0, quality=90
     )
     return _element(content, "WEBP", label)
 

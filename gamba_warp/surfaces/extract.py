@@ -157,9 +157,9 @@ def surface_of(
     """
     center, side = unit_frame(gaussians)
     moved = gaussians.in_unit(center, side).to(device)
-    found = extract_surface(moved, options, texture)
-    vertices = found.vertices * side + center.double().numpy()
-    return replace(found, vertices=vertices)
+    surface = extract_surface(moved, options, texture)
+    vertices = surface.vertices * side + center.double().numpy()
+    return replace(surface, vertices=vertices)
 
 
 def cleaned_mesh(
@@ -190,8 +190,8 @@ def cleaned_mesh(
     meshes.meshing_remove_null_faces()
     least = int(options.min_component * meshes.current_mesh().face_number())
     if options.largest:
-        kept = meshes.current_mesh().face_matrix()  # of parts that are connected by edges
-        parts = connected_component_labels(face_adjacency(kept), node_count=len(kept))
+        triangles = meshes.current_mesh().face_matrix()  # of parts that are connected by edges
+        parts = connected_component_labels(face_adjacency(triangles), node_count=len(triangles))
         least = max(least, int(np.bincount(parts).max(initial=0)))
     meshes.meshing_remove_connected_component_by_face_number(
         mincomponentsize=least, removeunref=True
@@ -215,5 +215,5 @@ def cleaned_mesh(
             targetfacenum=options.faces, preserveboundary=True, preservenormal=True
         )
         meshes.meshing_remove_unreferenced_vertices()
-    kept = meshes.current_mesh()
-    return kept.vertex_matrix(), kept.face_matrix().astype(np.int64)
+    cleaned = meshes.current_mesh()
+    return cleaned.vertex_matrix(), cleaned.face_matrix().astype(np.int64)

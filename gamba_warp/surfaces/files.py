@@ -77,8 +77,8 @@ def _save_textured(path: Path, surface: Surface, texture: Texture) -> None:
     image = Image.fromarray(to_uint8(texture.image))
     if path.suffix.lower() == ".glb":  # with vertices of their own at seams of the texture
         corners = np.column_stack([surface.faces.reshape(-1), texture.uvs.reshape(-1, 2)])
-        found, faces = merged(corners)
-        vertices, uvs = surface.vertices[found[:, 0].astype(np.int64)], found[:, 1:]
+        distinct, faces = merged(corners)
+        vertices, uvs = surface.vertices[distinct[:, 0].astype(np.int64)], distinct[:, 1:]
         faces = faces.reshape(-1, 3)
         material = PBRMaterial(baseColorTexture=image, metallicFactor=0.0, roughnessFactor=1.0)
         visual = cast(Any, TextureVisuals(uv=uvs, material=material))
@@ -105,8 +105,8 @@ def _write(path: Path, content: bytes | str) -> None:
 
 def mesh_suffixes(formats: Sequence[MeshFormat], texture: int) -> list[str]:
     """Return the suffixes of the files of ``write_meshes``."""
-    found = [f"-mesh.{kind}" for kind in formats]
-    return found + (["-mesh.mtl", "-mesh.png"] if texture and "obj" in formats else [])
+    suffixes = [f"-mesh.{kind}" for kind in formats]
+    return suffixes + (["-mesh.mtl", "-mesh.png"] if texture and "obj" in formats else [])
 
 
 def write_meshes(

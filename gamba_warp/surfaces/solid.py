@@ -65,8 +65,8 @@ def solid_of(
     distance = scene.compute_distance(points[beside.ravel()]).numpy() * voxels
     depth[beside] *= np.maximum(distance, _LEAST)
     corners, triangles, _, _ = marching_cubes(depth, 0.0, gradient_direction="ascent")
-    made = Manifold(Triangles(corners.astype(np.float32), triangles.astype(np.uint32)))
-    large = [part for part in made.decompose() if part.volume() > _FRACTION * made.volume()]
+    solid = Manifold(Triangles(corners.astype(np.float32), triangles.astype(np.uint32)))
+    large = [part for part in solid.decompose() if part.volume() > _FRACTION * solid.volume()]
     if not large:
         raise UserError(_EMPTY)
     corners, triangles = _decimated(Manifold.compose(large), max_faces)
@@ -91,20 +91,20 @@ def _decimated(solid: Manifold, max_faces: int) -> tuple[np.ndarray, np.ndarray]
     from pymeshlab import Mesh, MeshSet  # pyright: ignore[reportAttributeAccessIssue]
 
     if 0 < max_faces < solid.num_tri():
-        made, meshes = solid.to_mesh(), MeshSet()
-        vertices = made.vert_properties[:, :3].astype(np.float64)
-        meshes.add_mesh(Mesh(vertices, made.tri_verts.astype(np.int32)))
+        mesh, meshes = solid.to_mesh(), MeshSet()
+        vertices = mesh.vert_properties[:, :3].astype(np.float64)
+        meshes.add_mesh(Mesh(vertices, mesh.tri_verts.astype(np.int32)))
         meshes.meshing_decimation_quadric_edge_collapse(
             targetfacenum=max_faces, preservenormal=True, preservetopology=True
         )
         meshes.meshing_remove_unreferenced_vertices()
-        kept = meshes.current_mesh()
-        corners = kept.vertex_matrix().astype(np.float32)
+        decimated = meshes.current_mesh()
+        corners = decimated.vertex_matrix().astype(np.float32)
         # Edges where two sheets touch have four faces; they are split.
-        split = Manifold(Triangles(corners, kept.face_matrix().astype(np.uint32)))
+        split = Manifold(Triangles(corners, decimated.face_matrix().astype(np.uint32)))
         solid = split.simplify(_TOUCHING)
-    made = solid.to_mesh()
-    return made.vert_properties[:, :3].astype(np.float64), made.tri_verts.astype(np.int64)
+    mesh = solid.to_mesh()
+    return mesh.vert_properties[:, :3].astype(np.float64), mesh.tri_verts.astype(np.int64)
 
 
 def distances(points: np.ndarray, vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:

@@ -75,8 +75,8 @@ def _seen(
     pixel = at.floor().long()
     inside = ((pixel >= 0) & (pixel < size)).all(-1)
     x, y = torch.where(inside[:, None], pixel, 0).unbind(-1)
-    found = depth[y, x]
-    visible = inside & ((found - seen[:, 2]).abs() < near) & (found < CLEAR)
+    view_depth = depth[y, x]
+    visible = inside & ((view_depth - seen[:, 2]).abs() < near) & (view_depth < CLEAR)
     # Interpolated between the centres of pixels that hit the object.
     hit = ((depth > 0) & (depth < CLEAR)).to(rgb)[..., None]
     image = torch.cat([rgb * hit, hit], -1).permute(2, 0, 1)[None]
@@ -132,8 +132,8 @@ def bake_texture(
     known[texels] = True
     # Empty texels get the nearest known colour, to hide seams.
     missing = ~known.reshape(side, side)
-    found = distance_transform_edt(missing, return_distances=False, return_indices=True)
-    rows, columns = cast("tuple[np.ndarray, np.ndarray]", found)
+    indices = distance_transform_edt(missing, return_distances=False, return_indices=True)
+    rows, columns = cast("tuple[np.ndarray, np.ndarray]", indices)
     return Texture(uvs, image.reshape(side, side, 3)[rows, columns])
 
 

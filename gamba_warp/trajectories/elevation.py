@@ -88,7 +88,7 @@ def estimate_elevation(gaussians: Gaussians) -> ElevationEstimate:
 
 def _entropy(values: np.ndarray, weights: np.ndarray) -> float:
     """Entropy of the smoothed profile of weighted values."""
-    numbers = np.clip((values / 1.6 + 0.5) * _BINS, 0, _BINS - 1).astype(int)
-    profile = np.convolve(np.bincount(numbers, weights, _BINS), _SMOOTH, "same")
+    bins = np.clip((values / 1.6 + 0.5) * _BINS, 0, _BINS - 1).astype(int)
+    profile = np.convolve(np.bincount(bins, weights, _BINS), _SMOOTH, "same")
     profile = profile[profile > 0]
     return float(-(profile * np.log(profile)).sum())

@@ -39,13 +39,13 @@ def parse_size(text: str) -> tuple[int, int | None]:
     Raises:
         UserError: the text is malformed, or a side is out of range.
     """
-    found = re.fullmatch(r"(\d{1,9})(?:[xX](\d{1,9}))?", text.strip())
-    if found is None:
+    match = re.fullmatch(r"(\d{1,9})(?:[xX](\d{1,9}))?", text.strip())
+    if match is None:
         raise UserError(f"--size {text[:40]}: give a width such as 512, or WxH such as 640x360")
-    width, *rest = (int(side) for side in found.groups() if side is not None)
-    for side in (width, *rest):
+    width, *heights = (int(side) for side in match.groups() if side is not None)
+    for side in (width, *heights):
         check_range("--size", side, _SIDES)
-    return width, rest[0] if rest else None
+    return width, heights[0] if heights else None
 
 
 def parse_background(text: str) -> Color | None:
@@ -112,9 +112,9 @@ def plan_path(
         count = frames or turns * FRAMES
         shape = (width, height or width)
         return make(count, point, shape), False, count / (turns * SECONDS)
-    given = [name for name, value in {**view, "frames": frames}.items() if value is not None]
-    if given:
-        raise UserError(f"--{given[0]} applies to a turntable or a spiral, not to a file")
+    options = [name for name, value in {**view, "frames": frames}.items() if value is not None]
+    if options:
+        raise UserError(f"--{options[0]} applies to a turntable or a spiral, not to a file")
     path = load_path(trajectory, size)
     for side in (path.cameras.width, path.cameras.height):
         if side > int(_SIDES.le or 0) or side < 1:
@@ -150,7 +150,7 @@ def shoot(
     # Rendered at the origin with side 1, where float32 is most precise.
     moved = gaussians.in_unit(center, side).to(device)
     cameras = to_unit(film.cameras, center, side) if film.own else film.cameras
-    own = film.cameras if film.own else placed(film.cameras, center, side)
+    own_cameras = film.cameras if film.own else placed(film.cameras, center, side)
     near = {"near_plane": min(_NEAR, _NEAR / side)}
 
     def views(part: Cameras):
@@ -166,7 +166,7 @@ def shoot(
         save_image(target, next(counted())[0] / 255.0)
         return
     if kind == "png":
-        save_images(target, counted(), own, film.rate)
+        save_images(target, counted(), own_cameras, film.rate)
         return
     count = len(cameras.viewmats)
     every = cameras[:: max(1, count // _SAMPLE)]

@@ -142,10 +142,10 @@ def _write_gif(
             image.paste(0, mask=Image.fromarray(red & green & blue))
             yield image
 
-    rest = images()
+    remaining = images()
     # GIF counts time in units of 10 ms, and viewers slow down frames under 20 ms.
     duration = max(20, round(100 / rate) * 10)
-    next(rest).save(path, save_all=True, append_images=rest, duration=duration, loop=0)
+    next(remaining).save(path, save_all=True, append_images=remaining, duration=duration, loop=0)
 
 
 def _palette(frames: np.ndarray, background: tuple[int, int, int]) -> Image.Image:
@@ -164,8 +164,8 @@ def _palette(frames: np.ndarray, background: tuple[int, int, int]) -> Image.Imag
 def _write_mp4(path: Path, frames: Iterable[np.ndarray], rate: float) -> None:
     import imageio_ffmpeg
 
-    rest = iter(frames)
-    first = next(rest)
+    remaining = iter(frames)
+    first = next(remaining)
     height, width = first.shape[:2]
     odd = ((0, height % 2), (0, width % 2), (0, 0))
     size = f"{width + width % 2}x{height + height % 2}"
@@ -179,7 +179,7 @@ def _write_mp4(path: Path, frames: Iterable[np.ndarray], rate: float) -> None:
         assert process.stdin is not None
         try:
             with suppress(BrokenPipeError):  # it ended early; the exit code is checked below
-                for frame in itertools.chain([first], rest):
+                for frame in itertools.chain([first], remaining):
                     process.stdin.write(np.pad(frame, odd, mode="edge").tobytes())
             with suppress(BrokenPipeError):
                 process.stdin.close()

@@ -166,10 +166,10 @@ def viewed_mesh(mesh: TexturedMesh, axes: str = "opengl") -> ViewedMesh:
     paint = (255 * _corner_colors(mesh) + 0.5).astype(np.int64)
     # A vertex with several colours is split.
     keys = mesh.faces << 24 | paint[..., 0] << 16 | paint[..., 1] << 8 | paint[..., 2]
-    found, corners = np.unique(keys, return_inverse=True)
-    colors = np.stack([found >> 16 & 255, found >> 8 & 255, found & 255], 1) / np.float32(255)
+    pairs, corners = np.unique(keys, return_inverse=True)
+    colors = np.stack([pairs >> 16 & 255, pairs >> 8 & 255, pairs & 255], 1) / np.float32(255)
     faces = corners.reshape(mesh.faces.shape)
-    return ViewedMesh(vertices[found >> 24], faces, colors)
+    return ViewedMesh(vertices[pairs >> 24], faces, colors)
 
 
 def _corner_colors(mesh: TexturedMesh) -> np.ndarray:

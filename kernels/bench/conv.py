@@ -24,23 +24,23 @@ def tables(settings: Settings) -> list[Table]:
 def operator(settings: Settings) -> list[Variant]:
     """Convolution and SiLU, compared with torch's grouped convolution, in both layouts."""
     case = partial(conv_case, settings.device, _SIZES.get(settings.level, _FULL))
-    made = pair(case(), "default", default=True)
+    variants = pair(case(), "default", default=True)
     drop_in: Any = partial(causal_conv1d_fn, activation="silu")
-    made += pair(case(drop_in, True), "[B, D, L]")
+    variants += pair(case(drop_in, True), "[B, D, L]")
     others = {"torch conv1d": (peers.torch_conv, {"rounds": 10})}
     if settings.peers and settings.device.type == "cuda":
         others["causal-conv1d"] = peers.causal_conv1d, {}
     for name, (function, options) in others.items():
-        made += pair(case(function, True), name, peer=True, **options)
+        variants += pair(case(function, True), name, peer=True, **options)
         last = case(peers.channels_last(function, ("x",)))
-        made += pair(last, f"{name}, channels last", peer=True, **options)
-    return made
+        variants += pair(last, f"{name}, channels last", peer=True, **options)
+    return variants
 
 
 def knobs(settings: Settings) -> list[Variant]:
     """Half precision, compared with the exact values of the float32 inputs."""
     case = conv_case(settings.device, _SIZES.get(settings.level, _FULL))
-    made = pair(case, "float32", default=True)
+    variants = pair(case, "float32", default=True)
     for dtype in (torch.bfloat16, torch.float16):
-        made += pair(case, str(dtype).removeprefix("torch."), options={"dtype": dtype})
-    return made
+        variants += pair(case, str(dtype).removeprefix("torch."), options={"dtype": dtype})
+    return variants

@@ -325,7 +325,7 @@ def machine(settings: Settings) -> dict:
 
 def saved_bytes(forward: Callable[[], object], inputs: Iterable[torch.Tensor]) -> int:
     """Count the bytes that a forward pass keeps for its backward, without the inputs."""
-    given = {x.untyped_storage().data_ptr() for x in inputs}
+    input_pointers = {x.untyped_storage().data_ptr() for x in inputs}
     seen: dict[int, int] = {}
 
     def pack(x: torch.Tensor) -> torch.Tensor:
@@ -335,7 +335,7 @@ def saved_bytes(forward: Callable[[], object], inputs: Iterable[torch.Tensor]) -
     with torch.autograd.graph.saved_tensors_hooks(pack, lambda x: x):
         result = forward()
     del result
-    return sum(size for pointer, size in seen.items() if pointer not in given)
+    return sum(size for pointer, size in seen.items() if pointer not in input_pointers)
 
 
 def variant(case: Case, name: str, direction: str = "forward", **changes: Any) -> Variant:
@@ -349,7 +349,7 @@ def variant(case: Case, name: str, direction: str = "forward", **changes: Any) -
     """
     options = changes.pop("options", {})
     dtype = options.get("dtype")
-    given: dict[str, Any] = {
+    defaults: dict[str, Any] = {
         "run": partial(case.forward if direction == "forward" else case.backward, **options),
         "check": partial(case.check, direction, **options),
         "limit": case.limit(direction, dtype or torch.float32),
@@ -357,7 +357,7 @@ def variant(case: Case, name: str, direction: str = "forward", **changes: Any) -
         "dtype": str(dtype or torch.float32).removeprefix("torch."),
         "parameters": dict(case.sizes),
     }
-    return Variant(name, direction=direction, **(given | changes))
+    return Variant(name, direction=direction, **(defaults | changes))
 
 
 def pair(case: Case, name: str, **changes: Any) -> list[Variant]:

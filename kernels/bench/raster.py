@@ -69,15 +69,15 @@ def scenes(settings: Settings) -> list[Variant]:
     """The probe scene: Gaussians on a shell in one view, whole operator (project, sort, bin,
     blend), with standard deviations of 0.01, 0.02 and 0.04 of the object's size.
     """
-    made = []
+    variants = []
     for scale in (1, 2, 4):
         scene = make_scene(settings, scale)
-        variants = _pair(scene, f"scale {scale}", default=True)
-        variants += _peers(scene, f"scale {scale}") * settings.peers
-        for variant in variants:
+        of_scale = _pair(scene, f"scale {scale}", default=True)
+        of_scale += _peers(scene, f"scale {scale}") * settings.peers
+        for variant in of_scale:
             variant.parameters["scale"] = scale
-        made += variants
-    return made
+        variants += of_scale
+    return variants
 
 
 def _peers(scene: Case, name: str) -> list[Variant]:
@@ -104,7 +104,7 @@ def knobs(settings: Settings) -> list[Variant]:
     other renderers.
     """
     scene = make_scene(settings, 2, exact=_NO_THRESHOLDS)
-    made = _pair(scene, "default: alpha 1/255, T 1e-4", limit=TRADE_LIMIT, default=True)
+    variants = _pair(scene, "default: alpha 1/255, T 1e-4", limit=TRADE_LIMIT, default=True)
     trades = {f"alpha 1/{n}": {"alpha_min": 1 / n} for n in (4096, 1024, 64, 32, 16)}
     trades |= {f"T {limit:g}": {"t_min": limit} for limit in (1e-6, 1e-3, 1e-2, 1e-1)}
     if settings.level == "quick":
@@ -113,23 +113,23 @@ def knobs(settings: Settings) -> list[Variant]:
     for radius in (scene.sizes["side"] / 32, scene.sizes["side"] / 16):
         trades[f"radius clip {radius:g}"] = {"radius_clip": radius}
     for name, options in trades.items():
-        made += _pair(_with(scene, **options), name, limit=TRADE_LIMIT)
+        variants += _pair(_with(scene, **options), name, limit=TRADE_LIMIT)
     gaussians = scene.at()
     for opacity in (0.35, 0.4):
-        kept = gaussians["opacities"] >= opacity
-        pruned = {k: gaussians[k][kept] for k in LEAVES}
+        mask = gaussians["opacities"] >= opacity
+        pruned = {k: gaussians[k][mask] for k in LEAVES}
 
         def function(pruned: dict = pruned, **arguments: Any) -> tuple[Tensor, Tensor, dict]:
             return scene.function(**(arguments | pruned))
 
         case = replace(scene, function=function)
-        made.append(_variant(case, f"no opacities < {opacity}", limit=TRADE_LIMIT))
+        variants.append(_variant(case, f"no opacities < {opacity}", limit=TRADE_LIMIT))
     for dtype in (torch.bfloat16, torch.float16):
         name = str(dtype).removeprefix("torch.")
-        made += _pair(scene, f"{name} inputs", limit=TRADE_LIMIT, options={"dtype": dtype})
-    for v in made:
+        variants += _pair(scene, f"{name} inputs", limit=TRADE_LIMIT, options={"dtype": dtype})
+    for v in variants:
         v.parameters["scale"] = 2
-    return made
+    return variants
 
 
 def skipping(settings: Settings) -> list[Variant]:
@@ -138,11 +138,11 @@ def skipping(settings: Settings) -> list[Variant]:
     """
     quick = settings.level == "quick"
     scenes = {"few large": (512, 8.0), "many small": (4096 if quick else 65536, 0.5)}
-    made = []
+    variants = []
     for name, (count, scale) in scenes.items():
         scene = make_scene(settings, scale, count)
-        made += [v for direction in DIRECTIONS for v in switches(scene, name, direction)]
-    return made + partial_gradients(make_scene(settings, 2))
+        variants += [v for direction in DIRECTIONS for v in switches(scene, name, direction)]
+    return variants + partial_gradients(make_scene(settings, 2))
 
 
 _FORWARD = ("tile_test", "block_test", "stopped", "empty_tiles")  # the others are of the gradient
@@ -153,13 +153,13 @@ def switches(scene: Case, name: str, direction: str) -> list[Variant]:
     """Return the variants with each switch off alone, and all off; their bits are compared."""
     names = [x.name for x in fields(Skip) if direction == BOTH or x.name in _FORWARD]
     off = {"all on": (), **{f"{x} off": (x,) for x in names}, "all off": names}
-    made = []
+    variants = []
     for label, disabled in off.items():
         other = _with(scene, skip=Skip(**dict.fromkeys(disabled, False)))
         check = partial(measure.difference, other, scene, direction)
         changes = {"check": check, "limit": 0.0, "oracle": _SAME, "default": not disabled}
-        made.append(_variant(other, f"{name}: {label}", direction, **changes))
-    return made
+        variants.append(_variant(other, f"{name}: {label}", direction, **changes))
+    return variants
 
 
 def partial_gradients(scene: Case) -> list[Variant]:
@@ -172,10 +172,10 @@ def partial_gradients(scene: Case) -> list[Variant]:
         "gradient of colors alone": (replace(scene, fixed=others), "unasked"),
         "upstream gradient on a quarter": (replace(scene, cotangent=quarter), "zero_upstream"),
     }
-    made = []
+    calls = []
     for name, (changed, switch) in cases.items():
-        made += [v for v in switches(changed, name, BOTH) if v.default or f": {switch} " in v.name]
-    return made
+        calls += [v for v in switches(changed, name, BOTH) if v.default or f": {switch} " in v.name]
+    return calls
 
 
 def one_call(settings: Settings) -> list[Variant]:
@@ -186,7 +186,7 @@ def one_call(settings: Settings) -> list[Variant]:
     stacked = {k: torch.stack([x[k] for x in shells]) for k in LEAVES}
     cameras = viewmats.expand(objects, -1, -1, -1), Ks.expand(objects, -1, -1, -1)
     together = raster_case(stacked, cameras, size, settings.device)
-    made = _pair(together, "one call", default=True)
+    variants = _pair(together, "one call", default=True)
     single = [
         raster_case(gaussians, (viewmats[v : v + 1], Ks[v : v + 1]), size, settings.device)
         for gaussians in shells
@@ -195,9 +195,9 @@ def one_call(settings: Settings) -> list[Variant]:
     for direction in DIRECTIONS:
         runs = [s.forward if direction == "forward" else s.backward for s in single]
         run = partial(_call_all, runs)
-        made.append(_variant(single[0], f"{len(single)} calls", direction, run=run, work=None))
-        made[-1].parameters["views"] = len(single)
-    return made
+        variants.append(_variant(single[0], f"{len(single)} calls", direction, run=run, work=None))
+        variants[-1].parameters["views"] = len(single)
+    return variants
 
 
 def _call_all(runs: list) -> None:
@@ -218,7 +218,7 @@ def harmonics(settings: Settings) -> list[Variant]:
     quick = settings.level == "quick"
     sizes = [(2048 if quick else 16384, 1, degree) for degree in range(5)]
     sizes.append((2048, 2, 3) if quick else (262144, 4, 3))
-    made = []
+    variants = []
     for count, views, degree in sizes:
         g = torch.Generator().manual_seed(0)
         inputs = {
@@ -238,7 +238,7 @@ def harmonics(settings: Settings) -> list[Variant]:
             fixed=() if degree else ("means", "centers"),
         )
         name = f"degree {degree}, {count} Gaussians, {views} view{'s' * (views > 1)}"
-        made += measure.pair(case, f"ours, {name}", default=True)
+        variants += measure.pair(case, f"ours, {name}", default=True)
         formula = replace(case, function=case.reference)
-        made += measure.pair(formula, f"the formula in torch, {name}")
-    return made
+        variants += measure.pair(formula, f"the formula in torch, {name}")
+    return variants

@@ -149,14 +149,14 @@ def charts(document: dict) -> dict[str, str]:
     logarithmic. A ring is a default, a square a peer. What has no error, or has the same bits as
     another variant, is left out.
     """
-    made = {}
+    svgs = {}
     for op, group in groupby(document["records"], lambda r: r["op"]):
         records = [r for r in group if r["ms_p50"] and r["rel_rms_error"]]
         sizes = next((r["parameters"] for r in records if r["case"] == "knobs"), None)
         if sizes is not None:
             same = [r for r in records if sizes.items() <= r["parameters"].items()]
-            made[op] = _chart(f"{op}: {_sizes(same[0])}", same)
-    return made
+            svgs[op] = _chart(f"{op}: {_sizes(same[0])}", same)
+    return svgs
 
 
 def _chart(title: str, records: Sequence[dict]) -> str:

@@ -72,31 +72,31 @@ def knobs(settings: Settings) -> list[Variant]:
     the float32 inputs. The discretisations are different models, each with a formula of its own.
     """
     case = make_case(settings)
-    made = pair(case, "float32", default=True)
+    variants = pair(case, "float32", default=True)
     for dtype in (torch.bfloat16, torch.float16):
         name = f"{str(dtype).removeprefix('torch.')} inputs and output"
-        made += pair(case, name, options={"dtype": dtype})
+        variants += pair(case, name, options={"dtype": dtype})
     for discretization in ("bilinear", "zoh"):
-        made += pair(case, discretization, options={"discretization": discretization})
+        variants += pair(case, discretization, options={"discretization": discretization})
     batch, _, width = case.inputs["u"].shape
     state = torch.randn(batch, width, 16, generator=torch.Generator().manual_seed(2))
     tokens = SIZES[settings.level][2]
     start = scan_case(case.inputs, case.device, tokens, initial_state=state)
-    made += pair(start, "with an initial state")
-    return made + pair(make_case(settings, groups=4), "4 groups of B and C")
+    variants += pair(start, "with an initial state")
+    return variants + pair(make_case(settings, groups=4), "4 groups of B and C")
 
 
 def lengths(settings: Settings) -> list[Variant]:
     """Cost against the number of tokens. Saved: tensors of the forward pass besides its inputs;
     history: the states of all tokens.
     """
-    made = []
+    variants = []
     for length in (256, 1024) if settings.level == "quick" else (4096, 16384, 65536):
         case = make_case(settings, 8 if length > 16961 else 32, length=length)
         for direction in DIRECTIONS:
             work = partial(count_memory, case, direction)
-            made.append(variant(case, f"L {length}", direction, rounds=20, work=work))
-    return made
+            variants.append(variant(case, f"L {length}", direction, rounds=20, work=work))
+    return variants
 
 
 def count_memory(case: Case, direction: str) -> dict[str, int]:
@@ -113,27 +113,27 @@ def layers(settings: Settings) -> list[Variant]:
     mamba-130m, 5,120 of mamba-2.8b; in both layouts. Beside them the formula as a torch loop
     (Mamba's reference does it so), and peers where they are installed, on the same inputs.
     """
-    quick, made = settings.level == "quick", []
+    quick, variants = settings.level == "quick", []
     for length in (256,) if quick else (512, 2048, 8192):
         for width in (64,) if quick else (512, 1536, 5120):
             case = scan_case(make_inputs(1, length, width), settings.device, 512)
             name = f"{length} x {width}"
-            made += pair(case, name) + pair(_turned(case), f"{name}, [B, D, L]")
-            made += pair(case, f"{name}, bfloat16", options=_HALF)
+            variants += pair(case, name) + pair(_turned(case), f"{name}, [B, D, L]")
+            variants += pair(case, f"{name}, bfloat16", options=_HALF)
             if settings.peers and settings.device.type == "cuda":
                 theirs, label = peers.mamba_ssm_scan, f"mamba-ssm, {name}"
-                made += pair(_peer(case, theirs), label, peer=True)
+                variants += pair(_peer(case, theirs), label, peer=True)
                 last = _peer(
                     case, peers.channels_last(theirs, _TRANSPOSED[:-1]), channels_first=False
                 )
-                made += pair(last, f"{label}, channels last", peer=True)
+                variants += pair(last, f"{label}, channels last", peer=True)
             if length * width <= 2048 * 1536:  # others' code in torch takes seconds
                 loop, slow = _peer(case, peers.scan_loop), {"peer": True, "rounds": 3}
-                made.append(variant(loop, f"torch loop, {name}", **slow))
+                variants.append(variant(loop, f"torch loop, {name}", **slow))
                 if settings.peers:
                     mambapy = _peer(case, peers.mambapy_scan, channels_first=False)
-                    made += pair(mambapy, f"mambapy, {name}", **slow)
-    return made
+                    variants += pair(mambapy, f"mambapy, {name}", **slow)
+    return variants
 
 
 def packed(settings: Settings) -> list[Variant]:
@@ -143,18 +143,18 @@ def packed(settings: Settings) -> list[Variant]:
     length, width, _ = SIZES[settings.level]
     first = length // 8
     case = scan_case(make_inputs(1, length, width), settings.device, first)
-    made = pair(case, "one sequence", default=True)
+    variants = pair(case, "one sequence", default=True)
     for count in (8, 64):
         g = torch.Generator().manual_seed(count)
         cuts = first + torch.randperm(length - first, generator=g)[: count - 1].sort().values
         cuts[0] = first
         cuts = torch.tensor([0, *cuts.tolist(), length], dtype=torch.int32, device=settings.device)
         cut = replace(case, function=partial(case.function, cu_seqlens=cuts))
-        made += pair(cut, f"{count} sequences")
+        variants += pair(cut, f"{count} sequences")
         if count == 8:
             rows = make_inputs(count, int(cuts.diff().max()), width)
-            made += pair(scan_case(rows, settings.device, first), f"{count} sequences, padded")
-    return made
+            variants += pair(scan_case(rows, settings.device, first), f"{count} sequences, padded")
+    return variants
 
 
 def training_batch(settings: Settings) -> list[Variant]:
@@ -162,8 +162,8 @@ def training_batch(settings: Settings) -> list[Variant]:
     length, width, tokens = SIZES[settings.level]
     inputs = make_inputs(2 if settings.level == "quick" else 16, length, width)
     case = scan_case(inputs, settings.device, min(tokens, 2048))
-    made = pair(case, "default", options=_HALF, default=True)
-    made.append(variant(make_case(settings), "one sequence", options=_HALF))
+    variants = pair(case, "default", options=_HALF, default=True)
+    variants.append(variant(make_case(settings), "one sequence", options=_HALF))
     if settings.peers:
-        made += pair(_peer(case, peers.mamba_ssm_scan), "mamba-ssm", options=_HALF, peer=True)
-    return made
+        variants += pair(_peer(case, peers.mamba_ssm_scan), "mamba-ssm", options=_HALF, peer=True)
+    return variants

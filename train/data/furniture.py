@@ -91,8 +91,8 @@ def _find_libraries(deb: Path | None, tree: Path | None, scratch: Path) -> Path:
     if tree is not None:
         if not tree.is_dir():
             raise UserError(f"{tree}: no such folder")
-        found = next(iter(sorted(tree.rglob("*.sh3f"))), None)
-        return found.parent if found else tree
+        library = next(iter(sorted(tree.rglob("*.sh3f"))), None)
+        return library.parent if library else tree
     if deb is None:
         if INSTALLED.is_dir():
             return INSTALLED

@@ -56,28 +56,28 @@ def split_groups(objects: Sequence[ObjectInfo]) -> dict[str, str]:
         return uid
 
     # Objects to join, by the rule and its key.
-    found: dict[tuple[str, ...], list[str]] = defaultdict(list)
+    joined: dict[tuple[str, ...], list[str]] = defaultdict(list)
     named: dict[tuple[str, ...], list[str]] = defaultdict(list)
     for item in objects:
         words = words_of(item.name)
-        found["kind", item.library, words[-1]].append(item.uid)
+        joined["kind", item.library, words[-1]].append(item.uid)
         if len(words) == 1:
-            found["alone", words[0]].append(item.uid)
+            joined["alone", words[0]].append(item.uid)
         for texture in item.textures:
-            found["texture", texture].append(item.uid)
+            joined["texture", texture].append(item.uid)
         named[(item.library, *words)].append(item.uid)
     for whole in list(named):
         for count in range(3, len(whole)):  # the library, and two words at least
             if named.get(whole[:count]):
-                found[("begins", *whole[:count])] += named[whole[:count]] + named[whole]
-    for uids in found.values():
+                joined[("begins", *whole[:count])] += named[whole[:count]] + named[whole]
+    for uids in joined.values():
         for uid in uids:
             parent[root(uid)] = root(uids[0])
     kinds: dict[str, Counter[str]] = defaultdict(Counter)
     for item in objects:
         kinds[root(item.uid)][f"{item.library}-{words_of(item.name)[-1]}"] += 1
     names = {
-        first: min(found, key=lambda kind: (-found[kind], kind)) for first, found in kinds.items()
+        first: min(tally, key=lambda kind: (-tally[kind], kind)) for first, tally in kinds.items()
     }
     return {item.uid: names[root(item.uid)] for item in objects}
 
@@ -87,11 +87,11 @@ def textures_of(model: Path) -> frozenset[str]:
 
     Missing files, and names that leave the model's folder, are skipped.
     """
-    found = set()
+    digests = set()
     for library in _named_files(model, rb"(?m)^mtllib\s+(.+?)\s*$"):
         for image in _named_files(library, rb"(?m)^\s*map_\w+\s+(?:.*\s)?(\S+)\s*$"):
-            found.add(sha256(image))
-    return frozenset(found)
+            digests.add(sha256(image))
+    return frozenset(digests)
 
 
 def _named_files(path: Path, line: bytes) -> Iterator[Path]:
@@ -100,11 +100,11 @@ def _named_files(path: Path, line: bytes) -> Iterator[Path]:
         return
     for match in re.finditer(line, path.read_bytes()):
         try:
-            found = inside(path.parent, match[1].decode("latin-1"), str(path))
+            file = inside(path.parent, match[1].decode("latin-1"), str(path))
         except UserError:
             continue
-        if found.is_file():
-            yield found
+        if file.is_file():
+            yield file
 
 
 def words_of(name: str) -> list[str]:

@@ -121,8 +121,8 @@ class Pool:
 
     def _make_one(self, number: int) -> str | None:
         """Make an object in another process; return the reason of a failure."""
-        made = partial(_make_views, settings=self.settings)
-        _, result = next(iter(run_each(made, [number], workers=1)))
+        make = partial(_make_views, settings=self.settings)
+        _, result = next(iter(run_each(make, [number], workers=1)))
         if isinstance(result, Failed):
             return result.reason
         uid = f"procedural-{self.settings.seed}-{number}"
@@ -148,8 +148,8 @@ def _make_views(number: int, settings: Settings) -> Views:
 
     quiet_warp()
     torch.set_num_threads(1)
-    made = make_object(np.random.default_rng([settings.seed, number]))
-    return draw_views(made, str(number), settings)
+    mesh = make_object(np.random.default_rng([settings.seed, number]))
+    return draw_views(mesh, str(number), settings)
 
 
 def _files(views: Views, uid: str) -> ObjectFiles:

@@ -227,8 +227,8 @@ def render_meshes(
     workers = min(workers or os.cpu_count() or 1, len(meshes))
     threads = 1 if workers > 1 else torch.get_num_threads()
     attempt = partial(_attempt, out=out, settings=settings, threads=threads)
-    found = run_each(attempt, meshes, workers=workers)
-    for index, result in progress_bar(found, total=len(meshes), unit="object"):
+    results = run_each(attempt, meshes, workers=workers)
+    for index, result in progress_bar(results, total=len(meshes), unit="object"):
         mesh = meshes[index]
         if isinstance(result, Failed):
             failures[mesh.uid] = f"{mesh.path}: {result.reason.removeprefix(f'{mesh.path}: ')}"

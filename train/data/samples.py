@@ -72,9 +72,9 @@ def mirrored(views: ObjectViews) -> ObjectViews:
     flip = cameras.viewmats.new_tensor([-1.0, 1.0, 1.0, 1.0]).diag()
     Ks = cameras.Ks.clone()
     Ks[..., 0, 2] = cameras.width - Ks[..., 0, 2]
-    made = Cameras(flip @ cameras.viewmats @ flip, Ks, cameras.width, cameras.height)
+    flipped = Cameras(flip @ cameras.viewmats @ flip, Ks, cameras.width, cameras.height)
     depths, backs = (None if d is None else d.flip(-1) for d in (views.depths, views.backs))
-    return replace(views, images=views.images.flip(-2), cameras=made, depths=depths, backs=backs)
+    return replace(views, images=views.images.flip(-2), cameras=flipped, depths=depths, backs=backs)
 
 
 @dataclass
@@ -138,8 +138,8 @@ def with_foreground(batch: Batch, config: GambaConfig) -> Batch:
     """Return the batch with the padded foreground of its inputs, if the model needs it."""
     if config.decoder != "rays":
         return batch
-    found = find_foreground(batch.inputs[..., 3].cpu(), config)
-    return replace(batch, foreground=found.padded(config.ray_cells**2))
+    foreground = find_foreground(batch.inputs[..., 3].cpu(), config)
+    return replace(batch, foreground=foreground.padded(config.ray_cells**2))
 
 
 def _combined(parts: list[Any], make: Callable[[list[Tensor]], Any]) -> Any:
@@ -195,11 +195,11 @@ def load_sample(
             sides = f"{cameras.width}x{cameras.height}"
             raise UserError(f"{target.uid}: images are {sides}, training needs square ones")
     inputs, input_cameras = posed_input(source, config)
-    found = None
+    surface_depths = None
     if surfaces:
         empty = torch.zeros(source.images.shape[1:3])
         both = torch.stack([empty if d is None else d[0] for d in (source.depths, source.backs)])
-        found = both[None] * (config.distance / source.cameras.viewmats[0, :3, 3].norm())
+        surface_depths = both[None] * (config.distance / source.cameras.viewmats[0, :3, 3].norm())
     return Batch(
         uids=[target.uid],
         inputs=inputs,
@@ -207,7 +207,7 @@ def load_sample(
         targets=target.images[None],
         cameras=relative_cameras(target.cameras, config.distance)[None],
         background=background.reshape(1, 1, 3),
-        surfaces=found,
+        surfaces=surface_depths,
     )
 
 

@@ -108,16 +108,16 @@ class Shards:
         """
         from webdataset.compat import WebDataset
 
-        found: list[dict[str, Any]] = []
+        samples: list[dict[str, Any]] = []
         for sample in _read(WebDataset(self.urls, shardshuffle=False, nodesplitter=None)):
             if isinstance(sample, Unreachable):
                 raise sample
-            if len(found) == count:
+            if len(samples) == count:
                 break
             with suppress(UserError):
                 dataset_of(sample).files(0)
-                found.append(sample)
-        return dataset_of(*found)
+                samples.append(sample)
+        return dataset_of(*samples)
 
     def stream(self, seed: int) -> Iterator[dict[str, Any] | Unreachable]:
         """Yield samples for ``dataset_of`` without end, shuffled.

@@ -114,8 +114,8 @@ def depth_loss(gaussians: Gaussians, layers: int, cameras: Cameras, surfaces: Te
         values = values.unflatten(1, (-1, layers))[:, :, :: max(1, layers - 1)].transpose(1, 2)
         return values.expand(-1, 2, *values.shape[2:])
 
-    found = project_means(ends(gaussians.means).flatten(1, 2), cameras[:, None])
-    positions, depths = (x[:, 0].unflatten(1, (2, -1)) for x in found)
+    projected = project_means(ends(gaussians.means).flatten(1, 2), cameras[:, None])
+    positions, depths = (x[:, 0].unflatten(1, (2, -1)) for x in projected)
     column, row = positions.detach().floor().long().unbind(-1)
     inside = (column >= 0) & (column < width) & (row >= 0) & (row < height)
     pixel = row.clamp(0, height - 1) * width + column.clamp(0, width - 1)
@@ -150,11 +150,11 @@ def _shifted(maps: Tensor) -> Tensor:
     return torch.stack(down + right, 2)
 
 
-def _smooth_l1_mean(errors: Tensor, known: Tensor, kept: int) -> Tensor:
-    """Mean smooth L1 of the known errors, beta ``DEPTH_BETA``, over the axes after ``kept``."""
+def _smooth_l1_mean(errors: Tensor, known: Tensor, axis: int) -> Tensor:
+    """Mean smooth L1 of the known errors, beta ``DEPTH_BETA``, over the axes after ``axis``."""
     zero = errors.new_zeros(()).expand_as(errors)
     losses = F.smooth_l1_loss(errors, zero, beta=DEPTH_BETA, reduction="none")
-    sums = ((losses * known).flatten(kept + 1).sum(-1), known.flatten(kept + 1).sum(-1))
+    sums = ((losses * known).flatten(axis + 1).sum(-1), known.flatten(axis + 1).sum(-1))
     return sums[0] / sums[1].clamp_min(1)
 
 
@@ -340,15 +340,15 @@ def term_weights(loss: LossConfig, at: Progress) -> dict[str, float]:
 
 def loss_terms(inputs: LossInputs, weights: Mapping[str, Any]) -> dict[str, Tensor]:
     """Compute the terms with a nonzero weight or a tensor's, and those always computed."""
-    found = {}
+    terms = {}
     for name, term in TERMS.items():
         weight = weights.get(name)
         if term.always or isinstance(weight, Tensor) or weight:
             with record_function(term.label):
                 value = term.value(inputs)
             if value is not None:
-                found[name] = value
-    return found
+                terms[name] = value
+    return terms
 
 
 def total_loss(terms: Mapping[str, Tensor], weights: Mapping[str, Any]) -> Tensor:
@@ -384,5 +384,5 @@ def open_lpips(config: TrainConfig, device: str) -> tuple[LPIPS | None, str | No
         return None, "training without LPIPS, which needs --size 16 or more"
     if loss.lpips == "auto" and not lpips_available():
         return None, "no LPIPS weights: training without (gamba weights lpips fetches them)"
-    found, slow = load_lpips(), loss.lpips == "auto" and device == "cpu" and not loss.lpips_crop
-    return found, COST if slow else None
+    lpips, slow = load_lpips(), loss.lpips == "auto" and device == "cpu" and not loss.lpips_crop
+    return lpips, COST if slow else None

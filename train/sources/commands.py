@@ -183,8 +183,8 @@ def data_pack_command(
     from .pack import write_pack
 
     counts, failures = write_pack(data, out, size, shard_mb, workers or cores())
-    made = f"packed {counted(counts.total(), 'object')} into {counted(len(counts), 'shard')}"
-    print(f"{made} in {out}, {len(failures)} failed; next: gamba train {out}")
+    summary = f"packed {counted(counts.total(), 'object')} into {counted(len(counts), 'shard')}"
+    print(f"{summary} in {out}, {len(failures)} failed; next: gamba train {out}")
     _report_empty_splits(data)
     if note := background_note(open_dataset(data)):
         print(f"warning: {data}: {note}", file=sys.stderr)
@@ -206,8 +206,8 @@ def data_index_command(data: tyro.conf.Positional[Path]) -> int:
     print(f"{counted(count, 'object')}, {len(bad):,} left out, listed in {path}")
     for uid, reason in list(bad.items())[:_MAX_SHOWN]:
         say(f"left out: {uid}: {reason}", sys.stderr)
-    if (rest := len(bad) - _MAX_SHOWN) > 0:
-        print(f"left out: {rest:,} more, see {path}", file=sys.stderr)
+    if (more := len(bad) - _MAX_SHOWN) > 0:
+        print(f"left out: {more:,} more, see {path}", file=sys.stderr)
     return 1 if bad else 0
 
 
@@ -248,14 +248,14 @@ def data_gso_command(
     if others := others_of(source, listed):
         left = f"{counted(others, 'other object')} of the set outside the evaluation"
         print(f"{left}: gamba data render {source} --out DATA")
-    made, warnings, failed = make_views(out, meshes, size, workers)
+    rendered, warnings, failed = make_views(out, meshes, size, workers)
     failures |= failed
     code = _report(failures, "missing", warnings)
     views, missing = out / "views", f"{len(failures)} of {len(names)} missing"
-    print(f"rendered {counted(made, 'object')} into {views}, {missing}")
-    own = "" if objects is None else f" --objects {objects}"
-    evaluation = f"--protocol gso{own} --checkpoint MODEL --data {views} --out EVAL"
+    print(f"rendered {counted(rendered, 'object')} into {views}, {missing}")
+    objects_option = "" if objects is None else f" --objects {objects}"
+    evaluation = f"--protocol gso{objects_option} --checkpoint MODEL --data {views} --out EVAL"
     print(f"next: gamba eval-views {evaluation}")
     geometry = f"gamba eval-geometry EVAL/gaussians {out / 'meshes'}"
-    print(f"      {geometry} --protocol gso{own} --data {views}")
+    print(f"      {geometry} --protocol gso{objects_option} --data {views}")
     return code

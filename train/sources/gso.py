@@ -54,19 +54,19 @@ def find_models(source: Path, names: Sequence[str] = gso.NAMES) -> dict[str, Pat
     """
     if not source.is_dir():
         raise UserError(f"--source {source}: no such folder")
-    found = {}
+    models = {}
     for name in names:
         ends = [f"{name}{suffix}" for suffix in ("", ".zip")]
         paths = [folder / end for folder in (source, source / "models") for end in ends]
         path = next((p for p in paths if (p / MESH).is_file() or p.suffix and p.is_file()), None)
         if path is not None:
-            found[name] = path
-    if not found:
+            models[name] = path
+    if not models:
         raise UserError(
             f"--source {source}: contains none of the {len(names)} models "
             f"(such as {names[0]}/{MESH} or {names[0]}.zip)"
         )
-    return found
+    return models
 
 
 def others_of(source: Path, names: Sequence[str] = gso.NAMES) -> int:
@@ -101,8 +101,8 @@ def take_model(name: str, path: Path, out: Path) -> None:
 def _files(path: Path) -> Iterator[tuple[str, bytes]]:
     """Yield the files of a model that are copied: relative path and bytes."""
     if path.is_dir():
-        found = [p for f in _FOLDERS if (path / f).is_dir() for p in sorted((path / f).iterdir())]
-        members = [p.relative_to(path).as_posix() for p in found]
+        paths = [p for f in _FOLDERS if (path / f).is_dir() for p in sorted((path / f).iterdir())]
+        members = [p.relative_to(path).as_posix() for p in paths]
         members += [METADATA] if (path / METADATA).is_file() else []
         for member in filter(_max_size, members):
             yield member, read_bytes(inside(path, member, str(path)), _max_size(member))
@@ -155,9 +155,9 @@ def take_models(source: Path, out: Path, names: Sequence[str]) -> dict[str, str]
     """
     meshes = output_folder(out / "meshes")
     wanted = [name for name in names if not (meshes / name / "model.obj").is_file()]
-    found = find_models(source, wanted) if wanted else {}
-    failures = {name: f"not in {source}" for name in wanted if name not in found}
-    for name, path in progress_bar(list(found.items()), unit="model"):
+    models = find_models(source, wanted) if wanted else {}
+    failures = {name: f"not in {source}" for name in wanted if name not in models}
+    for name, path in progress_bar(list(models.items()), unit="model"):
         try:
             take_model(name, path, meshes)
         except UserError as error:

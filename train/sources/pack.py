@@ -58,13 +58,13 @@ def write_pack(
     counts, failures = Counter[str](), dict[str, str]()
     options = {"maxsize": shard_mb * 2**20, "encoder": False, "verbose": 0, "mtime": 0}
     with (
-        atomic_folder(out, replace=True) as made,
+        atomic_folder(out, replace=True) as folder,
         progress_bar(total=len(by_hash), desc="packing", unit="object") as bar,
     ):
         for split in SPLITS:
             if not (uids := [uid for uid in by_hash if splits[uid] == split]):
                 continue
-            pattern = str(made / f"{split}-%05d.tar")
+            pattern = str(folder / f"{split}-%05d.tar")
             with ThreadPoolExecutor(workers) as pool, ShardWriter(pattern, **options) as writer:
                 for start in range(0, len(uids), 2 * workers):  # few are in memory at a time
                     part = uids[start : start + 2 * workers]
@@ -75,8 +75,8 @@ def write_pack(
                         else:
                             writer.write(sample)
                             counts[Path(str(writer.fname)).name] += 1
-            if own := [{"url": n, "nsamples": counts[n]} for n in counts if n.startswith(split)]:
-                write_json(made / INDEX.format(split), {"shardlist": own})
+            if shards := [{"url": n, "nsamples": counts[n]} for n in counts if n.startswith(split)]:
+                write_json(folder / INDEX.format(split), {"shardlist": shards})
         if not counts:
             raise UserError(f"{data}: no object can be packed: {next(iter(failures.values()))}")
     return counts, failures
@@ -86,16 +86,16 @@ def _sample(dataset: ViewDataset, size: int | None, uid: str) -> dict[str, Any] 
     """Read one object, or return why it is unreadable; each image is decoded, to check it."""
     sample: dict[str, Any] = {"__key__": quote(uid, safe="/").replace(".", "%2E")}
     try:
-        found, frames = dataset.files(uid), list[dict[str, Any]]()
-        for view, pose in enumerate(found.camera_to_world):
+        files, frames = dataset.files(uid), list[dict[str, Any]]()
+        for view, pose in enumerate(files.camera_to_world):
             (pixels,), (K,) = dataset.images(uid, [view], size)
             intrinsics = dict(
                 zip(("fl_x", "fl_y", "cx", "cy"), K[[0, 1, 0, 1], [0, 1, 2, 2]].tolist())
             )
             frame = intrinsics | {"w": pixels.shape[1], "h": pixels.shape[0]}
-            kinds = {"depth_file": found.depths, "back_file": found.backs}
+            kinds = {"depth_file": files.depths, "back_file": files.backs}
             if size is None:
-                kinds |= {"file": found.images, "mask": found.masks}
+                kinds |= {"file": files.images, "mask": files.masks}
             else:
                 stream, frame["file_path"] = io.BytesIO(), f"{view:03d}.webp"
                 Image.fromarray(pixels).save(stream, "WEBP", lossless=True, exact=True)
@@ -109,5 +109,5 @@ def _sample(dataset: ViewDataset, size: int | None, uid: str) -> dict[str, Any] 
             frames.append(frame | {"transform_matrix": pose.tolist()})
     except EXPECTED as error:
         return first_line(error)
-    top = {"name": found.name, "attribution": found.attribution, "frames": frames}
-    return sample | {"json": json.dumps(top | {"depth_unit": found.depth_unit}).encode()}
+    top = {"name": files.name, "attribution": files.attribution, "frames": frames}
+    return sample | {"json": json.dumps(top | {"depth_unit": files.depth_unit}).encode()}
