@@ -70,7 +70,7 @@ class Edit(msgspec.Struct):
 class Result(NamedTuple):
     """A result of the strip, and the file of its small image."""
 
-    made: work.EditableObject
+    edited: work.EditableObject
     image: Path
 
 
@@ -216,7 +216,7 @@ class Actions:
         before = _given(cut)
         after = apply_strokes(before, _layers(painted))
         progress(0.1, "Running the network")
-        earlier = [each.made.chosen for each in results if each.made.given == after.key]
+        earlier = [each.edited.chosen for each in results if each.edited.image_key == after.key]
         chosen = earlier[-1] if earlier else None
         reconstruction = self._call(request, work.run_model, self._model, after, chosen)
         progress(0.8, "Making the viewer")
@@ -264,7 +264,7 @@ class Actions:
         if type(index) is not int or not 0 <= index < len(results):
             raise UserError("this result has expired")
         _forget_surfaces(results)
-        return _presented(results[index].made)
+        return _presented(results[index].edited)
 
     @page_errors()
     def edit(self, message: dict[str, Any], results: list[Result], state: State | None) -> Any:
@@ -273,7 +273,9 @@ class Actions:
             edit = msgspec.convert(message, Edit)
         except msgspec.ValidationError as error:
             raise UserError(f"the edit: {error}") from None
-        reconstruction = next((each.made for each in results if each.made.key == edit.key), None)
+        reconstruction = next(
+            (each.edited for each in results if each.edited.key == edit.key), None
+        )
         if reconstruction is None:
             raise UserError("this result has expired")
         work.edit(reconstruction, edit.elevation, edit.removed)
@@ -324,7 +326,7 @@ class Actions:
         latest = [*results, Result(reconstruction, path)][-MAX_IMAGES:]
         if len(latest) == len(results):
             gr.Info(f"The strip keeps the last {MAX_IMAGES} results.")
-        strip = [(str(result.image), result.made.name) for result in latest]
+        strip = [(str(result.image), result.edited.name) for result in latest]
         shown = gr.update(value=strip, visible=len(latest) > 1, selected_index=None)
         return latest, shown, *_presented(reconstruction)
 
@@ -380,7 +382,7 @@ class Actions:
 def _forget_surfaces(results: list[Result]) -> None:
     """Free the surfaces of results that are not shown; one with a texture takes up to 60 MB."""
     for result in results:
-        result.made.surface = None
+        result.edited.surface = None
 
 
 def _presented(reconstruction: work.EditableObject) -> tuple:

@@ -77,13 +77,13 @@ MESH = MeshChoice()
 
 @dataclass(eq=False, kw_only=True)
 class EditableObject(Reconstruction):
-    """Reconstruction that can be edited; ``gaussians`` are all, ``kept`` those left.
+    """Reconstruction that can be edited; ``gaussians`` are all, ``left`` those left.
 
     Attributes:
         image: the model's input ``[S, S, 4]`` uint8, reduced.
-        surface: of ``kept``, the last one that was extracted, or None.
+        surface: of ``left``, the last one that was extracted, or None.
         choice: its number of faces at most, and if it is closed.
-        given: key of the image.
+        image_key: key of the image.
         chosen: elevation that was set by hand, or None.
         removed: ``[N]`` bool, Gaussians that were removed by hand; every edit makes a new tensor.
         key: unpredictable name.
@@ -92,7 +92,7 @@ class EditableObject(Reconstruction):
     image: np.ndarray
     surface: Surface | None = None
     choice: tuple[int, bool] | None = None
-    given: str = ""
+    image_key: str = ""
     chosen: float | None = None
     removed: torch.Tensor = field(init=False)
     key: str = field(init=False)
@@ -102,7 +102,7 @@ class EditableObject(Reconstruction):
         self.key = secrets.token_hex(8)
 
     @property
-    def kept(self) -> Gaussians:
+    def left(self) -> Gaussians:
         """The Gaussians that are left, ``[n]``."""
         return self.gaussians.select(~self.removed)
 
@@ -116,16 +116,16 @@ def run_model(model: Gamba, cut: Cut, elevation: float | None = None) -> Editabl
     rgba = model_image(cut)
     reconstruction = reconstruct_object(model, cut.name, rgba, elevation)
     small = to_uint8(shrink(rgba, _IMAGE))
-    return EditableObject(**vars(reconstruction), image=small, given=cut.key, chosen=elevation)
+    return EditableObject(**vars(reconstruction), image=small, image_key=cut.key, chosen=elevation)
 
 
 def surface_of(
-    made: EditableObject, mesh: MeshChoice, device: str = "cpu", texture: int = 0
+    edited: EditableObject, mesh: MeshChoice, device: str = "cpu", texture: int = 0
 ) -> Surface:
     """Return the surface of a reconstruction, and keep it.
 
     Args:
-        made: the reconstruction.
+        edited: the reconstruction.
         mesh: number of faces, and if it is closed.
         device: device that renders.
         texture: side of a texture, pixels; without one the surface may have any.
@@ -133,76 +133,76 @@ def surface_of(
     Raises:
         UserError: there is none, or a library is missing.
     """
-    surface, choice = made.surface, (mesh.faces, mesh.watertight)
+    surface, choice = edited.surface, (mesh.faces, mesh.watertight)
     baked = 0 if surface is None or surface.texture is None else len(surface.texture.image)
-    if surface is None or made.choice != choice or texture not in (0, baked):
+    if surface is None or edited.choice != choice or texture not in (0, baked):
         options = SurfaceOptions(colors=True, faces=mesh.faces, watertight=mesh.watertight)
         options.require(texture)
         chosen = torch.device(device)
-        surface = extract.surface_of(made.kept, options, chosen, texture)
-        made.surface, made.choice = surface, choice
+        surface = extract.surface_of(edited.left, options, chosen, texture)
+        edited.surface, edited.choice = surface, choice
     return surface
 
 
-def thumbnail(made: EditableObject, path: Path, device: str = "cpu") -> None:
+def thumbnail(edited: EditableObject, path: Path, device: str = "cpu") -> None:
     """Write a small image of the object, from the input's camera.
 
     Raises:
         UserError: the file cannot be written.
     """
-    frames = turntable_frames(made.kept.to(device), made.view, size=_SMALL, frames=1)
+    frames = turntable_frames(edited.left.to(device), edited.view, size=_SMALL, frames=1)
     save_image(path, frames[0] / 255.0)
 
 
-def viewer(made: EditableObject) -> str:
+def viewer(edited: EditableObject) -> str:
     """Return the viewer of a reconstruction, with its last surface: a complete HTML document.
 
     Raises:
         UserError: the object is invisible.
     """
-    bits = made.removed[visible_order(made.gaussians, made.name)].numpy()
+    bits = edited.removed[visible_order(edited.gaussians, edited.name)].numpy()
     removed = base64.b64encode(np.packbits(bits, bitorder="little").tobytes()).decode()
-    edit = {"key": made.key, "removed": removed, "elevation": made.view.elevation}
-    return viewer_page(made.name, made.gaussians, edit=edit, **_shown(made))
+    edit = {"key": edited.key, "removed": removed, "elevation": edited.view.elevation}
+    return viewer_page(edited.name, edited.gaussians, edit=edit, **_shown(edited))
 
 
-def edit(made: EditableObject, elevation: float, removed: bytes) -> None:
+def edit(edited: EditableObject, elevation: float, removed: bytes) -> None:
     """Rotate a reconstruction, and leave Gaussians out, which forgets its surface.
 
     Args:
-        made: the reconstruction.
+        edited: the reconstruction.
         elevation: of the image's camera above the object, degrees; the result is upright.
         removed: a bit for each Gaussian, in the order of the viewer, the lowest bit first.
 
     Raises:
         UserError: the number of bits is wrong, or nothing would be left.
     """
-    order = visible_order(made.gaussians, made.name)
+    order = visible_order(edited.gaussians, edited.name)
     bits = np.unpackbits(np.frombuffer(removed, np.uint8), bitorder="little")
     if len(removed) != -(-len(order) // 8) or bits[len(order) :].any():
         raise UserError("the removed parts are not those of this object")
     gone = torch.from_numpy(bits[: len(order)].astype(bool))
     if gone.all():
         raise UserError("this removes all Gaussians")
-    before, surface, angle = made.removed, made.surface, elevation - made.view.elevation
-    made.removed = torch.zeros_like(before).index_fill(0, order[gone], True)
-    if not made.removed.equal(before):
-        made.surface = None
+    before, surface, angle = edited.removed, edited.surface, elevation - edited.view.elevation
+    edited.removed = torch.zeros_like(before).index_fill(0, order[gone], True)
+    if not edited.removed.equal(before):
+        edited.surface = None
     elif surface is not None:
         vertices = surface.vertices @ upright(angle).double().numpy().T
-        made.surface = replace(surface, vertices=vertices)
+        edited.surface = replace(surface, vertices=vertices)
     if angle:
-        made.gaussians = set_up(made.gaussians, angle)
-        made.view = made.view.changed(elevation)
-        made.chosen = elevation
+        edited.gaussians = set_up(edited.gaussians, angle)
+        edited.view = edited.view.changed(elevation)
+        edited.chosen = elevation
 
 
-def _shown(made: EditableObject) -> dict:
-    return {"camera": made.view.camera, "mesh": made.surface, "image": made.image / 255.0}
+def _shown(edited: EditableObject) -> dict:
+    return {"camera": edited.view.camera, "mesh": edited.surface, "image": edited.image / 255.0}
 
 
 def write(
-    made: EditableObject,
+    edited: EditableObject,
     kind: str,
     folder: Path,
     device: str = "cpu",
@@ -211,7 +211,7 @@ def write(
     """Write one file of a reconstruction.
 
     Args:
-        made: the reconstruction.
+        edited: the reconstruction.
         kind: one of ``KINDS``.
         folder: exists.
         device: device that renders.
@@ -226,24 +226,24 @@ def write(
     """
     if kind not in KINDS:
         raise UserError(f"no such kind of file: {kind}")
-    path, note = folder / f"{made.name}{KINDS[kind][1]}", None
+    path, note = folder / f"{edited.name}{KINDS[kind][1]}", None
     if kind in GAUSSIANS:
-        gaussians, count = to_be_written(made.kept)
+        gaussians, count = to_be_written(edited.left)
         lost = write_gaussians(path, gaussians, kind)  # type: ignore[arg-type]
         note = f"{lost} {count}" if lost else count
     elif kind in MESHES:
         texture = mesh.texture if kind == "mesh-glb" else 0
-        surface = surface_of(made, mesh, device, texture)
+        surface = surface_of(edited, mesh, device, texture)
         save_mesh(path, surface if texture else replace(surface, texture=None))
     elif kind == "zip":
         with tempfile.TemporaryDirectory(dir=folder) as inner, atomic_path(path) as temporary:
             with zipfile.ZipFile(temporary, "w", zipfile.ZIP_DEFLATED) as archive:
                 for part in IN_ZIP:
-                    file, _ = write(made, part, Path(inner), device, mesh)
+                    file, _ = write(edited, part, Path(inner), device, mesh)
                     archive.write(file, file.name)
     elif kind == "gif":
-        frames = turntable_frames(made.kept.to(device), made.view, size=SIZE, frames=FRAMES)
+        frames = turntable_frames(edited.left.to(device), edited.view, size=SIZE, frames=FRAMES)
         save_turntable(path, frames)
     else:
-        write_viewer(path, made.name, made.kept, **_shown(made))
+        write_viewer(path, edited.name, edited.left, **_shown(edited))
     return path, note

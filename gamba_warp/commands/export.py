@@ -83,7 +83,7 @@ def export_command(
         item = Object(name=name, gaussians=content.shape, view=view, in_unit=True)
         count, figures = outputs.write(item, content.comments)
         say(" ".join([f"{name}: {count}", *figures["notes"]]))
-        results.made.append({"input": str(path), "name": name, **figures})
+        results.figures.append({"input": str(path), "name": name, **figures})
 
     for_each(names, one, "export", "file", failures)
     return results

@@ -148,7 +148,9 @@ def reconstruct_command(
         for line in (f"{name}: {count}", *figures["notes"]):
             say(line)
         source = {"input": str(original), "name": name, "cutout": cut.how, "warning": cut.warning}
-        results.made.append(source | {"elevation": elevation, "elevation_doubt": between} | figures)
+        results.figures.append(
+            source | {"elevation": elevation, "elevation_doubt": between} | figures
+        )
 
     for_each(names, one, "reconstruct", "image", failures)
     failures[:] = [(_given(path), reason) for path, reason in failures]

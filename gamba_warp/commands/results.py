@@ -29,14 +29,14 @@ class Results:
         count: number of inputs.
         out: folder or file of the results.
         failures: as ``for_each`` returns them.
-        made: figures of each other input, with its ``input`` and ``name``.
+        figures: of each other input, with its ``input`` and ``name``.
     """
 
     unit: str
     count: int
     out: Path
     failures: list[tuple[Path, str]]
-    made: list[dict[str, Any]] = field(default_factory=list)
+    figures: list[dict[str, Any]] = field(default_factory=list)
 
     def text(self) -> str:
         """Return a line with counts and the folder."""
@@ -49,7 +49,7 @@ class Results:
     def json(self) -> str:
         """Return the same as a JSON object."""
         failures = [{"input": str(item), "reason": reason} for item, reason in self.failures]
-        values = {"out": str(self.out), "results": self.made, "failures": failures}
+        values = {"out": str(self.out), "results": self.figures, "failures": failures}
         return json.dumps(values, indent=2)
 
 

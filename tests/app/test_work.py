@@ -44,29 +44,29 @@ def two(tmp_path_factory):
 
 
 @pytest.fixture(scope="module")
-def made(tmp_path_factory):
+def edited(tmp_path_factory):
     image = cut_out(tmp_path_factory.mktemp("made") / "thing.png")
     cut = cutting.cut_image(image, "My  thing.v2.png", CutoutOptions())
     return work.run_model(load_model(STARTER / "tiny.safetensors"), cut)
 
 
-def test_a_image_from_above_stands_upright(tmp_path, made):
+def test_a_image_from_above_stands_upright(tmp_path, edited):
     """Rotation like ``reconstruct --elevation``, in the viewer's camera and in every file."""
     image = cut_out(tmp_path / "thing.png")
     cut = cutting.cut_image(image, "thing.png", CutoutOptions())
     above = work.run_model(load_model(STARTER / "tiny.safetensors"), cut, 30.0)
     turn = orbit(torch.zeros(1), 30.0)[0, :3, :3]
-    torch.testing.assert_close(above.kept.means @ turn.T, made.kept.means)
-    assert above.view == made.view.changed(30.0) and made.view.elevation == 0
-    made = replace(made, name="thing", surface=None)
+    torch.testing.assert_close(above.left.means @ turn.T, edited.left.means)
+    assert above.view == edited.view.changed(30.0) and edited.view.elevation == 0
+    edited = replace(edited, name="thing", surface=None)
     corners = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0]], np.float64)
-    made.surface = extract.Surface(corners, np.array([[0, 1, 2]]))
-    nothing = bytes(-(-visible(made.gaussians, "").num // 8))
+    edited.surface = extract.Surface(corners, np.array([[0, 1, 2]]))
+    nothing = bytes(-(-visible(edited.gaussians, "").num // 8))
     for elevation in (10.0, 30.0):  # rotations add up
-        work.edit(made, elevation, nothing)
-    torch.testing.assert_close(made.kept.means, above.kept.means, atol=1e-6, rtol=0)
-    np.testing.assert_allclose(made.surface.vertices, corners @ turn.double().numpy(), atol=1e-6)
-    assert made.view == above.view and made.chosen == above.chosen == 30
+        work.edit(edited, elevation, nothing)
+    torch.testing.assert_close(edited.left.means, above.left.means, atol=1e-6, rtol=0)
+    np.testing.assert_allclose(edited.surface.vertices, corners @ turn.double().numpy(), atol=1e-6)
+    assert edited.view == above.view and edited.chosen == above.chosen == 30
     path, _ = work.write(above, "ply", tmp_path)
     options = quick(STARTER / "tiny.safetensors", tmp_path / "out", 30)
     assert run_reconstruct(image, *options) == 0
@@ -249,29 +249,29 @@ def test_names_of_strangers(name, stem):
     assert cutting.stem(name) == stem
 
 
-def test_every_kind_of_file(made, tmp_path):
+def test_every_kind_of_file(edited, tmp_path):
     suffixes = {kind: suffix for kind, (_, suffix) in work.KINDS.items()}
     assert len(set(suffixes.values())) == len(suffixes), "no two files have one name"
     assert {"ply", "splat", "spz", "compressed-ply", "gif", "html"} < set(suffixes)
     for kind in work.GAUSSIANS:
-        path, note = work.write(made, kind, tmp_path)
+        path, note = work.write(edited, kind, tmp_path)
         assert path.name == "My-thing-v2" + suffixes[kind]
-        assert read_gaussians(path).num == made.kept.drawn().num > 0
-        assert f"{made.kept.drawn().num:,} Gaussians" in note
-    path, _ = work.write(made, "html", tmp_path)
+        assert read_gaussians(path).num == edited.left.drawn().num > 0
+        assert f"{edited.left.drawn().num:,} Gaussians" in note
+    path, _ = work.write(edited, "html", tmp_path)
     assert "<canvas" in path.read_text(encoding="utf-8")
-    refused("no such kind of file: exe", work.write, made, "exe", tmp_path)
+    refused("no such kind of file: exe", work.write, edited, "exe", tmp_path)
     assert not [p for p in tmp_path.iterdir() if p.name.startswith(".")]
 
 
-def test_the_turntable(made, tmp_path, monkeypatch):
+def test_the_turntable(edited, tmp_path, monkeypatch):
     monkeypatch.setattr(work, "FRAMES", 3)
-    path, _ = work.write(made, "gif", tmp_path)
+    path, _ = work.write(edited, "gif", tmp_path)
     with Image.open(path) as image:
         assert image.n_frames == 3 and image.size == (work.SIZE, work.SIZE)
 
 
-def test_a_mesh(made, tmp_path, monkeypatch):
+def test_a_mesh(edited, tmp_path, monkeypatch):
     """The surface is faked: it takes half a minute and has its own tests."""
     trimesh = pytest.importorskip("trimesh")
     asked = []
@@ -285,15 +285,15 @@ def test_a_mesh(made, tmp_path, monkeypatch):
     monkeypatch.setattr(extract, "surface_of", surface_of)
     for kind, suffix in (("mesh-stl", ".stl"), ("mesh-glb", ".glb")):
         mesh = work.MeshChoice.of("50,000 faces", "Texture 512", True)
-        path, _ = work.write(made, kind, tmp_path, mesh=mesh)
+        path, _ = work.write(edited, kind, tmp_path, mesh=mesh)
         assert path.name == f"My-thing-v2-mesh{suffix}"
         mesh = trimesh.load(path, force="mesh")
         assert len(mesh.faces) == 4 and mesh.bounds[:, 1].tolist() == [-1, 0]  # y up
-    assert asked == [(made.kept.num, 50_000, True, side, "cpu") for side in (0, 512)]
+    assert asked == [(edited.left.num, 50_000, True, side, "cpu") for side in (0, 512)]
     refused("no such mesh", work.MeshChoice.of, "50,000 faces", "10,000 faces", True)
     asked.clear()
     monkeypatch.setattr(work, "FRAMES", 2)
-    path, _ = work.write(made, "zip", tmp_path)
+    path, _ = work.write(edited, "zip", tmp_path)
     with zipfile.ZipFile(path) as archive:
         names = {f"My-thing-v2{work.KINDS[kind][1]}" for kind in work.IN_ZIP}
         assert {*archive.namelist()} == names and archive.testzip() is None
@@ -301,43 +301,43 @@ def test_a_mesh(made, tmp_path, monkeypatch):
     assert len(asked) == 1  # both of its meshes are of one surface
 
 
-def test_what_is_removed_is_in_no_file(made, tmp_path, monkeypatch):
-    made = replace(made, name="thing", surface=None)
-    seen = visible(made.gaussians, "thing")
+def test_what_is_removed_is_in_no_file(edited, tmp_path, monkeypatch):
+    edited = replace(edited, name="thing", surface=None)
+    seen = visible(edited.gaussians, "thing")
     bits = np.zeros(seen.num, bool)
     bits[[0, 3, seen.num - 1]] = True
-    made.surface = Mock()
-    work.edit(made, 0, np.packbits(bits, bitorder="little").tobytes())
-    assert made.surface is None and made.kept.num == made.gaussians.num - 3
-    left = visible(made.kept, "thing")
+    edited.surface = Mock()
+    work.edit(edited, 0, np.packbits(bits, bitorder="little").tobytes())
+    assert edited.surface is None and edited.left.num == edited.gaussians.num - 3
+    left = visible(edited.left, "thing")
     torch.testing.assert_close(left.means, seen.means[~torch.from_numpy(bits)])
     for kind in ("ply", "splat"):
-        path, note = work.write(made, kind, tmp_path)
-        assert read_gaussians(path).num == made.kept.drawn().num == seen.num - 3
+        path, note = work.write(edited, kind, tmp_path)
+        assert read_gaussians(path).num == edited.left.drawn().num == seen.num - 3
     asked = []
     monkeypatch.setattr(extract, "surface_of", lambda gaussians, *_: asked.append(gaussians.num))
     monkeypatch.setattr(
         work, "turntable_frames", lambda gaussians, *_, **__: asked.append(gaussians.num)
     )
     monkeypatch.setattr(work, "save_turntable", lambda *_: None)
-    work.surface_of(made, work.MESH)
-    work.write(made, "gif", tmp_path)
-    assert asked == [made.kept.num] * 2
-    again = work.viewer(made)
+    work.surface_of(edited, work.MESH)
+    work.write(edited, "gif", tmp_path)
+    assert asked == [edited.left.num] * 2
+    again = work.viewer(edited)
     removed = np.packbits(bits, bitorder="little").tobytes()
     assert f'"count": {seen.num},' in again and base64.b64encode(removed).decode() in again
-    work.edit(made, 0, bytes(-(-seen.num // 8)))
-    assert made.kept.num == made.gaussians.num
+    work.edit(edited, 0, bytes(-(-seen.num // 8)))
+    assert edited.left.num == edited.gaussians.num
 
 
-def test_a_mesh_of_an_object_that_is_edited_meanwhile(page, made, monkeypatch):
+def test_a_mesh_of_an_object_that_is_edited_meanwhile(page, edited, monkeypatch):
     """The file is written, but the surface, of the object before, is not kept."""
-    made = replace(made, name="thing", surface=None)
-    size = -(-visible(made.gaussians, "").num // 8)
+    edited = replace(edited, name="thing", surface=None)
+    size = -(-visible(edited.gaussians, "").num // 8)
 
     def write(one, kind, folder, *_):
         if kind == "mesh-stl":
-            work.edit(made, 0, bytes([1]) + bytes(size - 1))
+            work.edit(edited, 0, bytes([1]) + bytes(size - 1))
         one.surface = surface
         path = folder / "mesh"
         path.touch()
@@ -346,19 +346,19 @@ def test_a_mesh_of_an_object_that_is_edited_meanwhile(page, made, monkeypatch):
     monkeypatch.setattr(work, "write", write)
     for kind, kept in (("mesh-stl", False), ("mesh-glb", True)):
         surface, choices = Mock(), ("10,000 faces", "No texture", False)
-        _, frame = page.writer(kind)((made, []), *choices, MagicMock(), lambda *_: None)
-        assert (made.surface is surface) == kept == isinstance(frame, str)
+        _, frame = page.writer(kind)((edited, []), *choices, MagicMock(), lambda *_: None)
+        assert (edited.surface is surface) == kept == isinstance(frame, str)
 
 
 @pytest.fixture
-def page(made, tmp_path, monkeypatch):
+def page(edited, tmp_path, monkeypatch):
     """Handlers of the page; computations and the server are stand-ins."""
     pytest.importorskip("gradio", reason="needs gradio: pip install '.[app]'")
     from gamba_warp.app import actions
 
     monkeypatch.setattr(actions, "cut_image", lambda path, name, _: Mock(title=name, warning=""))
-    monkeypatch.setattr(work, "run_model", lambda _, cut: replace(made, name=cut.title))
-    monkeypatch.setattr(work, "viewer", lambda made: made.name)
+    monkeypatch.setattr(work, "run_model", lambda _, cut: replace(edited, name=cut.title))
+    monkeypatch.setattr(work, "viewer", lambda edited: edited.name)
     monkeypatch.setattr(work, "thumbnail", lambda *_: None)
     thread = Mock(call=lambda function, wanted: function())
     return actions.Actions(None, None, Mock(new_folder=lambda: tmp_path), "cpu", thread)
@@ -381,13 +381,13 @@ def test_the_strip_keeps_the_last_results(page, monkeypatch):
             page, map(str, range(len(results), most + 1)[:count]), results
         )
     names = [str(number) for number in range(1, most + 1)]
-    assert [each.made.name for each in results] == [name for _, name in strip] == names
+    assert [each.edited.name for each in results] == [name for _, name in strip] == names
     assert said == ["The strip keeps the last 12 results."]
 
 
-def test_each_of_several_images_is_shown_once_it_is_done(page, made, monkeypatch):
+def test_each_of_several_images_is_shown_once_it_is_done(page, edited, monkeypatch):
     run = []
-    monkeypatch.setattr(work, "run_model", lambda _, cut: run.append(cut.title) or made)
+    monkeypatch.setattr(work, "run_model", lambda _, cut: run.append(cut.title) or edited)
     shown = results_of(page, "abc", [])
     for count in (1, 2):
         results, strip = next(shown)
@@ -404,14 +404,14 @@ def test_each_of_several_images_is_shown_once_it_is_done(page, made, monkeypatch
     assert run == ["a", "b", "cancelled"], "the next one is not begun"
 
 
-def test_an_elevation_set_by_hand_stays_with_its_image(page, made, monkeypatch):
+def test_an_elevation_set_by_hand_stays_with_its_image(page, edited, monkeypatch):
     asked = []
     monkeypatch.setattr(
         work, "run_model", lambda _, cut, angle: asked.append(angle) or new(cut.key)
     )
 
     def new(key):
-        return replace(made, name="a", given=key)
+        return replace(edited, name="a", image_key=key)
 
     one, other = (Mock(key=key) for key in "ab")
     monkeypatch.setattr("gamba_warp.app.actions.apply_strokes", lambda cut, _: cut)
@@ -419,13 +419,13 @@ def test_an_elevation_set_by_hand_stays_with_its_image(page, made, monkeypatch):
     for cut in (one, one, other, one):
         results = page.reconstruct(cut, None, results, MagicMock(), lambda *_: None)[4]
         if len(results) == 2:
-            work.edit(results[1].made, 35, bytes(-(-visible(made.gaussians, "").num // 8)))
-            results[1].made.chosen = 35
+            work.edit(results[1].edited, 35, bytes(-(-visible(edited.gaussians, "").num // 8)))
+            results[1].edited.chosen = 35
     assert asked[:3] == [None, None, None] and asked[3] == 35
 
 
-def test_what_waits_for_the_device(page, made, tmp_path):
-    """Files that render nothing are written while a mesh or a movie is made."""
+def test_what_waits_for_the_device(page, edited, tmp_path):
+    """Files that render nothing are written while a mesh or a movie is edited."""
     from gamba_warp.app.interface import build
 
     page._main_thread.call = Mock(side_effect=AssertionError("it waits"))
@@ -437,7 +437,7 @@ def test_what_waits_for_the_device(page, made, tmp_path):
         waits = events[f"file-{kind}"].concurrency_id == events["make"].concurrency_id
         assert waits == (kind in {"gif", "zip", *work.MESHES})
         if not waits:
-            state, inputs = (made, []), ("10,000 faces", "No texture", False, MagicMock(), Mock())
+            state, inputs = (edited, []), ("10,000 faces", "No texture", False, MagicMock(), Mock())
             listed, _ = page.writer(kind)(state, *inputs)
             assert listed["value"] == [str(path) for path in state[1]] and state[1][0].is_file()
     assert events["cancel"].concurrency_id != events["make"].concurrency_id
@@ -445,7 +445,7 @@ def test_what_waits_for_the_device(page, made, tmp_path):
         assert [each.elem_id for each in events[name].show_progress_on] == ["status"]
 
 
-def test_the_stages_of_a_mesh_are_shown(page, made, monkeypatch):
+def test_the_stages_of_a_mesh_are_shown(page, edited, monkeypatch):
     def surface_of(*_):
         STAGES.begin("mesh texture")
         raise main_thread.Cancelled("that is enough")
@@ -453,17 +453,17 @@ def test_the_stages_of_a_mesh_are_shown(page, made, monkeypatch):
     monkeypatch.setattr(extract, "surface_of", surface_of)
     said, choices = [], ("10,000 faces", "No texture", False)
     gradio = pytest.importorskip("gradio")
-    state = replace(made, surface=None), []
+    state = replace(edited, surface=None), []
     with pytest.raises(gradio.Error, match="that is enough"):
         page.writer("mesh-stl")(state, *choices, MagicMock(), lambda *step: said.append(step))
     assert said == [(0.1, "Writing -mesh.stl"), (0.7, "mesh texture")]
     assert STAGES.show is None
 
 
-def test_the_viewer_has_the_input_and_the_last_mesh(made):
-    made = replace(made, surface=None)
-    bare = work.viewer(made)
+def test_the_viewer_has_the_input_and_the_last_mesh(edited):
+    edited = replace(edited, surface=None)
+    bare = work.viewer(edited)
     assert '"faces": 0' in bare and '"image": "data:image/webp;base64,' in bare
     corners = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0]], np.float64)
-    made.surface = extract.Surface(corners, np.array([[0, 1, 2]]))
-    assert '"faces": 1,' in work.viewer(made)
+    edited.surface = extract.Surface(corners, np.array([[0, 1, 2]]))
+    assert '"faces": 1,' in work.viewer(edited)
