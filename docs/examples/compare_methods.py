@@ -98,7 +98,7 @@ def main(arguments: list[str] | None = None) -> None:
         reports[name] = [place]
 
     # Shapes: a file for each object, named like the true ones.
-    gts = out / "truths"
+    gts = out / "gt"
     gts.mkdir(exist_ok=True)
     for uid in uids:
         shutil.copy(options.meshes / f"{uid}.ply", gts)
