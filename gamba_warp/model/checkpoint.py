@@ -12,11 +12,10 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from os import PathLike
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import torch
-from torch import Tensor, nn
-from torch.overrides import TorchFunctionMode
+from torch import Tensor
 
 from ..errors import UserError, first_line
 from ..files import STARTER, atomic_path, output_folder
@@ -175,20 +174,13 @@ def _sort_metadata(path: Path) -> None:
         file.write(text.encode().ljust(size))
 
 
-class _Outline(TorchFunctionMode):
-    """Skip random initialization, whose first use on the meta device takes seconds."""
-
-    def __torch_function__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
-        return None if func is nn.init.normal_ else func(*args, **(kwargs or {}))
-
-
 def outline(config: GambaConfig) -> Gamba:
     """Build the model of a configuration on the meta device, without memory.
 
     Raises:
         UserError: the encoder is unknown or too large.
     """
-    with torch.device("meta"), _Outline():
+    with torch.device("meta"):
         return Gamba(config, encoder=outline_encoder(config))
 
 

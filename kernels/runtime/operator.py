@@ -2,23 +2,27 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
+from operator import attrgetter
 from typing import Any
 
 import torch
 from torch import Tensor
 from torch.autograd import forward_ad
 
-_PLAIN = (Tensor, torch.nn.Parameter)
+_PLAIN = {Tensor, torch.nn.Parameter}
+_is_meta = attrgetter("is_meta")
 
 
-def _tensors(values: Sequence[Any]) -> Iterator[Tensor]:
+def _tensors(values: Sequence[Any]) -> list[Tensor]:
     """The tensors among arguments and within their lists."""
+    tensors = []
     for x in values:
         if isinstance(x, Tensor):
-            yield x
+            tensors.append(x)
         elif isinstance(x, (list, tuple)):
-            yield from (y for y in x if isinstance(y, Tensor))
+            tensors += _tensors(x)
+    return tensors
 
 
 def has_tangent(*values: Any) -> bool:
@@ -36,7 +40,8 @@ def _needs_dispatcher(tensors: Sequence[Tensor]) -> bool:
         or torch._C._len_torch_dispatch_stack() > 0
         or torch._C._are_functorch_transforms_active()
         or torch._C._get_tracing_state() is not None
-        or any(type(x) not in _PLAIN or x.is_meta for x in tensors)
+        or not _PLAIN.issuperset(map(type, tensors))
+        or any(map(_is_meta, tensors))
     )
 
 
@@ -84,7 +89,7 @@ def operator(
         function = Direct.apply
 
     def call(*args: Any) -> Any:
-        tensors = [*_tensors(args)]
+        tensors = _tensors(args)
         if has_tangent(*tensors):
             raise NotImplementedError(
                 f"{name}: forward-mode derivatives (torch.func.jvp, jacfwd, dual numbers) are not "

@@ -11,6 +11,7 @@ from torch.nn import functional as F
 
 from ...gaussians import Gaussians
 from ..config import GambaConfig
+from .weights import init_normal
 
 MIN_SCALE = 1e-6  # object units; keeps the logarithm stored in files finite
 
@@ -53,7 +54,7 @@ class GaussianDecoder(nn.Module):
         # spread the centres by about 0.1 per axis: inside any object, and far from a saturated
         # softmax, whose gradient would vanish.
         fan_in = 0.356 * self.position.in_features
-        nn.init.normal_(self.position.weight, std=config.position_init * fan_in**-0.5)
+        init_normal(self.position.weight, std=config.position_init * fan_in**-0.5)
         nn.init.zeros_(self.position.bias)
         odds = config.opacity_init / (1 - config.opacity_init)
         nn.init.constant_(self.opacity.bias, math.log(odds))
@@ -69,13 +70,13 @@ class GaussianDecoder(nn.Module):
         """Give unit variance before each SiLU, whose mean square on a unit normal is 0.356."""
         for layer in (first, second):
             nn.init.zeros_(layer.bias)
-        nn.init.normal_(first.weight, std=first.in_features**-0.5)
-        nn.init.normal_(second.weight, std=(0.356 * second.in_features) ** -0.5)
+        init_normal(first.weight, std=first.in_features**-0.5)
+        init_normal(second.weight, std=(0.356 * second.in_features) ** -0.5)
 
     @staticmethod
     def init_head(head: nn.Linear) -> None:
         """Make the output of a head almost 0 at the start."""
-        nn.init.normal_(head.weight, std=0.02)
+        init_normal(head.weight, std=0.02)
         nn.init.zeros_(head.bias)
 
     def forward(self, tokens: Tensor) -> Gaussians:

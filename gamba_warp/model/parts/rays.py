@@ -29,6 +29,7 @@ from ...cameras import Cameras, exact_product
 from ...gaussians import Gaussians
 from ..config import GambaConfig
 from .patches import Foreground, cell_colors
+from .weights import init_normal
 
 FRONT_OPACITY = 3.0  # logit; overlapping neighbours are opaque together
 HIDDEN_OPACITY = -5.4  # logit; just over 1/255, below which a Gaussian has no gradient
@@ -68,7 +69,7 @@ class RayDecoder(nn.Module):
         self.mix = nn.Linear(features, last) if config.ray_hidden else None
         self.head = nn.Linear(last, layers * sum(self._parts()))
         # Almost 0, so that every · of the formulas starts near 0.
-        nn.init.normal_(self.head.weight, std=0.002)
+        init_normal(self.head.weight, std=0.002)
         nn.init.zeros_(self.head.bias)
         hidden = layers - 1
         depths = [0.0] + [LAST_DEPTH * (i + 1) / hidden for i in range(hidden)]

@@ -10,6 +10,7 @@ from ...cameras import Cameras, plucker_rays
 from ...conventions import IMAGENET_MEAN, IMAGENET_STD, over_background
 from ..config import GambaConfig
 from .patches import Foreground, near_patches, patch_pixels, scan_orders
+from .weights import init_normal
 
 
 def normalize_imagenet(images: Tensor) -> Tensor:
@@ -66,7 +67,7 @@ class SplatTokens(nn.Module):
         self.embedding = nn.Parameter(torch.empty(config.num_tokens, config.width))
         # E is nearly as large as an image token. On plain background only E distinguishes the
         # tokens, and the positions start spread out only if the tokens differ.
-        nn.init.normal_(self.embedding, std=config.embedding_init)
+        init_normal(self.embedding, std=config.embedding_init)
         vars(self.embedding)["_no_weight_decay"] = True
         orders = scan_orders(grid, grid, config.scan_orders, config.num_orders).flatten()
         self.register_buffer("orders", orders.to(self.embedding.device), persistent=False)

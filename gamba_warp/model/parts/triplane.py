@@ -19,6 +19,7 @@ from ...gaussians import Gaussians
 from ..config import GambaConfig
 from .block import make_norm, run_blocks
 from .decoder import GaussianDecoder
+from .weights import init_normal
 
 AXES = ((0, 1), (0, 2), (1, 2))  # of the planes: the first along a row, the second down a column
 
@@ -32,12 +33,12 @@ class PlaneBranch(nn.Module):
         side, features = config.triplane_size, config.triplane_features
         self.sides = 3, side, side
         self.embedding = nn.Parameter(torch.empty(3 * side**2, config.width))
-        nn.init.normal_(self.embedding, std=config.embedding_init)
+        init_normal(self.embedding, std=config.embedding_init)
         vars(self.embedding)["_no_weight_decay"] = True
         self.blocks = blocks
         self.norm = make_norm(config, final=True)
         self.features = nn.Linear(config.width, features)
-        nn.init.normal_(self.features.weight, std=config.width**-0.5)
+        init_normal(self.features.weight, std=config.width**-0.5)
         nn.init.zeros_(self.features.bias)
 
     def forward(self, batch: int, states: Sequence[Any], checkpointing: bool = False) -> Tensor:
