@@ -239,7 +239,8 @@ def test_bfloat16_products_keep_the_value_and_the_gradients_direction(state):
         found[precision] = (value, torch.autograd.grad(value.sum(), got)[0])
         assert value.dtype == torch.float32
     (value, gradient), (low, lower) = found[torch.float32], found[torch.bfloat16]
-    assert 0 < ((low - value) / value).abs().max() < 1e-3  # 0 would be float32 again
+    # 48 such images on a CPU that does not multiply bfloat16: rms 1.5e-3, largest 4e-3.
+    assert 0 < ((low - value) / value).abs().max() < 1e-2  # 0 would be float32 again
     cosine = torch.nn.functional.cosine_similarity(lower.flatten(), gradient.flatten(), 0)
     assert 0 < 1 - cosine < 1e-3
     assert (net(want, want, torch.bfloat16) == 0).all()
