@@ -36,7 +36,7 @@ from gamba_warp.errors import UserError, first_line
 from gamba_warp.model.config import GambaConfig
 
 from .config import TrainConfig
-from .data.pool import VIEWS as MADE_VIEWS
+from .data.pool import VIEWS as POOL_VIEWS
 from .data.pool import Pool
 from .data.poses import front_views
 from .data.samples import Batch, choose_views, draw_change, join, load_sample
@@ -366,11 +366,11 @@ class Batches:
         if not views.procedural or self._procedural is not None:
             return
         images = Settings(
-            views=MADE_VIEWS,
+            views=POOL_VIEWS,
             size=max(views.size, self.model.image_size),
             seed=self.config.run.seed,
             depth=self.config.loss.depth_weight > 0,
-            fronts=MADE_VIEWS // 3,
+            fronts=POOL_VIEWS // 3,
             light="randomized",
             up="y",
             **VARIED_CAMERAS,

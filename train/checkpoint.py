@@ -274,7 +274,7 @@ def save_checkpoint(run: Path, step: int, models: dict[str, Gamba], state: dict,
         try:
             torch.save(state, temporary / "state.pt")
         except RuntimeError as error:  # raised by torch's zip writer
-            reason = f"state.pt cannot be written whole, is the disk full? ({reason_of(error)})"
+            reason = f"state.pt cannot be written; is the disk full? ({reason_of(error)})"
             raise OSError(reason) from error
         write_json(temporary / CHECKSUMS, {p.name: sha256(p) for p in sorted(temporary.iterdir())})
     write_json(run / "latest.json", {"checkpoint": f"checkpoints/{target.name}", "step": step})
@@ -308,7 +308,7 @@ def find_checkpoint(
         checkpoints = list_checkpoints(run)
         if checkpoints and resume == "never":
             raise UserError(f"{run}: already holds a run; give another --out or --resume auto")
-        return _newest_whole(checkpoints, warn) if checkpoints else None
+        return _newest_intact(checkpoints, warn) if checkpoints else None
     path = Path(resume)
     if not (path / "state.pt").is_file():
         checkpoints = list_checkpoints(path)
@@ -318,13 +318,13 @@ def find_checkpoint(
     reason = damage(path)
     if reason:
         beside = [p for p in list_checkpoints(path.parent.parent) if p != path]
-        whole = next((p for p in reversed(beside) if not damage(p)), None)
-        advice = f"whole is: --resume {whole}" if whole else "no other is whole"
+        intact = next((p for p in reversed(beside) if not damage(p)), None)
+        advice = f"--resume {intact} is intact" if intact else "no other is intact"
         raise UserError(f"{reason}; {advice}")
     return path
 
 
-def _newest_whole(checkpoints: list[Path], warn: Callable[[str], None]) -> Path:
+def _newest_intact(checkpoints: list[Path], warn: Callable[[str], None]) -> Path:
     """Return the newest intact checkpoint. Raises UserError if all are damaged."""
     reasons = []
     for checkpoint in reversed(checkpoints):
@@ -450,7 +450,7 @@ def find_initial(path: Path, warn: Callable[[str], None] = warnings.warn) -> Pat
         if reason:
             raise UserError(f"--init {reason}")
     elif checkpoints := list_checkpoints(path):
-        path = _newest_whole(checkpoints, warn)
+        path = _newest_intact(checkpoints, warn)
     names = [name for name in ("ema.safetensors", "model.safetensors") if (path / name).is_file()]
     if not names:
         raise UserError(f"--init {path}: holds neither a model nor a checkpoint")

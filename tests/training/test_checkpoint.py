@@ -163,7 +163,7 @@ def test_a_flipped_bit_is_found_and_the_older_checkpoint_taken(tmp_path, two, na
     said = []
     assert find_checkpoint(tmp_path, "auto", said.append) == two[0]
     assert len(said) == 1 and "step_000002" in said[0] and f"resuming from {two[0]}" in said[0]
-    words = f"step_000002/.*; whole is: --resume {two[0]}"
+    words = f"step_000002/.*; --resume {two[0]} is intact"
     refused(words, find_checkpoint, tmp_path, str(two[1]))
     flip(two[0] / "model.safetensors", 0.6)
     refused("no checkpoint of this run is intact", find_checkpoint, tmp_path, "auto")
