@@ -35,8 +35,8 @@ def make(batch, length, channels, states, groups=1, dtype=torch.float32):
 
 
 def leaves(inputs, dtype=None):
-    """Copies that require gradients, in another dtype if one is given."""
-    return {k: v.detach().clone().to(dtype or v.dtype).requires_grad_() for k, v in inputs.items()}
+    """Leaves that require gradients, in another dtype if one is given, else of the same memory."""
+    return {k: v.detach().to(dtype or v.dtype).requires_grad_() for k, v in inputs.items()}
 
 
 def oracle(*args, **kwargs):
@@ -46,9 +46,23 @@ def oracle(*args, **kwargs):
 
 
 def gradients(leaves, outs, heads):
-    """The gradients by name of the outputs' products with their cotangents, ``heads``."""
-    total = sum((x * v.to(x.dtype)).sum() for x, v in zip(outs, heads))
-    return dict(zip(leaves, torch.autograd.grad(total, [*leaves.values()])))
+    """The gradients by name for cotangents of the outputs, ``heads``."""
+    heads = [v.to(x.dtype) for x, v in zip(outs, heads)]
+    return dict(zip(leaves, torch.autograd.grad(outs[: len(heads)], [*leaves.values()], heads)))
+
+
+def run(function, inputs, heads, dtype=None, **options):
+    """The results of a scan with softplus, and all gradients, by name."""
+    mine = leaves(inputs, dtype)
+    outs = function(**mine, delta_softplus=True, **options)
+    return dict(zip(("out", "last"), outs)) | gradients(mine, outs, heads)
+
+
+def of_squares(inputs, **options):
+    """The output, and all gradients of the sum of its squares."""
+    mine = leaves(inputs)
+    out = selective_scan(**mine, delta_softplus=True, **options)
+    return [out, *torch.autograd.grad(out.square().sum(), [*mine.values()])]
 
 
 def assert_gradients(ours, exact, limit, half=0.0, heads=None, tiny=0.0, more=None):
@@ -166,3 +180,19 @@ def compare(inputs, forward=FORWARD, gradient=GRADIENT, state=2e-6, **options):
         assert_rel_rms(got, wants[1], state + more["last"], "last state alone")
     limits = gradient, max(forward, 1e-5)
     assert_gradients((mine, outs), (theirs, wants), *limits, heads, tiny, more)
+
+
+def compare_state(inputs, state=1e-6, gradient=GRADIENT, **options):
+    """The same for ``selective_scan_state``, of the inputs that it takes."""
+    options = {"delta_softplus": True} | options
+    inputs = {k: inputs[k] for k in STATE}
+
+    def exact(**tensors):
+        return oracle(C=torch.zeros_like(tensors["B"]), **tensors)[1:]
+
+    mine, theirs = leaves(inputs), leaves(inputs, torch.float64)
+    last, wants = selective_scan_state(**mine, **options), exact(**theirs, **options)
+    heads = [torch.randn_like(last)]
+    more = device_errors(exact, inputs, heads, names=["last"], **options)
+    assert_rel_rms(last, wants[0], state + more["last"], "last state")
+    assert_gradients((mine, [last]), (theirs, wants), gradient, heads=heads, more=more)

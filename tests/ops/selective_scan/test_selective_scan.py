@@ -2,28 +2,24 @@
 
 import pytest
 import torch
-from helpers import assert_rel_rms, assert_same_on_threads, on_threads, rel_rms
+from helpers import assert_same_on_threads, on_threads, rel_rms
 from helpers.scan import (
-    FORWARD,
     STATE,
     assert_gradient_alone,
-    assert_gradients,
     compare,
+    compare_state,
     device_errors,
     every_discretization,
-    gradients,
     leaves,
     make,
+    of_squares,
     oracle,
 )
 
-from gamba_warp.kernels.selective_scan import (
-    selective_scan,
-    selective_scan_fn,
-    selective_scan_state,
-)
+from gamba_warp.kernels.selective_scan import selective_scan, selective_scan_state
 from gamba_warp.kernels.selective_scan.cpu import launch as cpu
 from gamba_warp.kernels.selective_scan.cpu.launch import Extent, Layout
+from gamba_warp.kernels.selective_scan.cuda import launch as cuda
 from gamba_warp.kernels.selective_scan.problem import Inputs, Options, Scan
 from gamba_warp.kernels.selective_scan.reference import selective_scan_reference
 
@@ -67,11 +63,11 @@ def test_without_options():
     compare(inputs, delta_softplus=False)
 
 
-@pytest.mark.parametrize("device", ["cpu", "ptx"])
+@pytest.mark.usefixtures("each_device")
 @pytest.mark.parametrize(
     "length, delta, bias", [*((n, 0, 3.0) for n in (15, 17, 63, 65, 130)), (200, 40, 0.0)]
 )
-def test_public_reports(length, delta, bias, device, from_ptx):
+def test_public_reports(length, delta, bias):
     """Issues 368 and 880 of mamba-ssm do not happen here.
 
     Behind the last token a step is not 0 once bias and softplus have been applied. With steps of
@@ -80,11 +76,10 @@ def test_public_reports(length, delta, bias, device, from_ptx):
     inputs = make(1, length, 5, 3)
     inputs["delta"] += delta
     inputs["delta_bias"] = torch.full((5,), bias) if bias else inputs["delta_bias"]
-    if device == "ptx":
-        from_ptx()
     compare(inputs)
 
 
+@pytest.mark.usefixtures("each_device")
 @pytest.mark.parametrize(
     "dtype, of_delta, limit",
     [
@@ -96,39 +91,39 @@ def test_public_reports(length, delta, bias, device, from_ptx):
 def test_half_precision(dtype, of_delta, limit):
     """Limits: the rounding of the dtype itself, 2^-9 and 2^-12 at most, on output only."""
     inputs = make(2, 65, 37, 3, dtype=dtype)
-    compare(inputs | {"delta": inputs["delta"].to(of_delta)}, limit)
+    compare(inputs | {"delta": inputs["delta"].to(of_delta)}, limit, 2e-6)
 
 
-@pytest.mark.parametrize("device", ["cpu", "ptx"])
+@pytest.mark.usefixtures("each_device")
 @pytest.mark.parametrize("name", ["B", "C"])
-def test_b_or_c_alone_in_half_precision(name, device, from_ptx):
+def test_b_or_c_alone_in_half_precision(name):
     """The other keeps its float32: results have the bits of both in float32."""
     inputs = make(1, 20, 34, 3)
     inputs[name] = inputs[name].bfloat16()
-    if device == "ptx":
-        from_ptx()
-    results = []
-    for tensors in (inputs, inputs | {name: inputs[name].float()}):
-        mine = leaves(tensors)
-        out = selective_scan(**mine, delta_softplus=True)
-        results.append({"out": out} | gradients(mine, [out], [torch.ones_like(out)]))
-    for key, got in results[0].items():
-        assert torch.equal(got, results[1][key].to(got.dtype)), key
-    assert results[0][name].dtype == torch.bfloat16
+    half, whole = (of_squares(x) for x in (inputs, inputs | {name: inputs[name].float()}))
+    for key, got, want in zip(("out", *inputs), half, whole):
+        assert torch.equal(got, want.to(got.dtype)), key
+        assert got.dtype == (torch.bfloat16 if key == name else torch.float32)
 
 
-@pytest.mark.parametrize(
-    "name", ["u", "delta", "A", "B", "C", "D", "z", "delta_bias", "initial_state"]
-)
+@pytest.mark.usefixtures("each_device")
+@pytest.mark.parametrize("name", Inputs._fields[:9])
 def test_one_gradient_alone(name):
     assert_gradient_alone(selective_scan, make(2, 70, 20, 3), name, delta_softplus=True)
 
 
-def test_unneeded_gradients_are_not_computed():
-    x = Scan(Inputs(**make(1, 10, 5, 2)), Options(None, True, "mamba", save=True))
-    out, _, saved = cpu.forward(x)
-    needs = Inputs(*(name == "C" for name in Inputs._fields))
-    grads = cpu.backward(torch.ones_like(out), None, x, saved, needs)
+@pytest.mark.parametrize("kernels", [cpu, cuda])
+@pytest.mark.parametrize("name, absent", [("C", ()), ("A", ("C", "D", "z"))])
+def test_unneeded_gradients_are_not_computed(name, absent, kernels, from_ptx):
+    """Of the whole scan, and of the last state alone."""
+    inputs = Inputs(**make(1, 10, 5, 2))._replace(**dict.fromkeys(absent))
+    if kernels is cuda:
+        from_ptx()
+    x = Scan(inputs, Options(None, True, "mamba", save=True))
+    out, last, saved = kernels.forward(x)
+    v_out = None if absent else torch.ones_like(out)
+    needs = Inputs(*(k == name for k in Inputs._fields))
+    grads = kernels.backward(v_out, torch.ones_like(last), x, saved, needs)
     assert Inputs(*(g is not None for g in grads)) == needs
 
 
@@ -176,13 +171,7 @@ def test_split_consistency(cut):
 
 def test_repeatable_and_independent_of_threads():
     inputs = make(2, 200, 150, 5)
-
-    def made():
-        mine = leaves(inputs)
-        out = selective_scan(**mine, delta_softplus=True)
-        return out, *torch.autograd.grad(out.square().sum(), [*mine.values()])
-
-    assert_same_on_threads(made, 1, 1, 2)
+    assert_same_on_threads(lambda: of_squares(inputs), 1, 1, 2)
 
 
 def test_strided_inputs_are_not_copied():
@@ -225,6 +214,7 @@ def test_growing_states_and_nan_are_passed_on():
     assert not bad[:5].any() and not bad[:, :3].any() and not bad[:, 4:].any()
 
 
+@pytest.mark.usefixtures("each_device")
 @pytest.mark.parametrize("batch, length", [(0, 5), (2, 0), (0, 0)])
 def test_empty(batch, length):
     inputs = leaves(make(batch, length, 6, 3))
@@ -235,6 +225,8 @@ def test_empty(batch, length):
     for (name, x), grad in zip(inputs.items(), grads):
         assert grad.shape == x.shape, name
         assert (grad == (2 if name == "initial_state" else 0)).all(), name
+    alone = {name: inputs[name] for name in STATE}
+    assert torch.equal(selective_scan_state(**alone, delta_softplus=True), last)
 
 
 @pytest.mark.parametrize(
@@ -311,56 +303,14 @@ def test_states_computed_together_change_no_bit(at_once, back_at_once, monkeypat
     inputs, results = make(2, 173, 24, 5), []
     for tuning in (cpu.TUNING, cpu.Tuning(at_once=at_once, back_at_once=back_at_once)):
         monkeypatch.setattr(cpu, "TUNING", tuning)
-        mine = leaves(inputs)
-        out = selective_scan(**mine, delta_softplus=True)
-        results.append([out, *torch.autograd.grad(out.square().sum(), [*mine.values()])])
-    assert all(torch.equal(a, b) for a, b in zip(*results))
+        results.append(of_squares(inputs))
+    assert all(map(torch.equal, *results))
 
 
 @pytest.mark.parametrize("table", [True, False])
 def test_the_polynomial_without_avx_512_is_as_exact_as_the_table(table, monkeypatch):
     monkeypatch.setattr(cpu, "TUNING", cpu.Tuning(table=table))
     compare(make(1, 300, 20, 4))
-
-
-@pytest.mark.parametrize("constant", ["", "B", "C"])
-def test_mamba_ssm_signature(constant):
-    inputs = make(2, 33, 20, 5, groups=4)
-    del inputs["initial_state"]
-    if constant:
-        inputs[constant] = torch.randn(20, 5)
-    their = dict(inputs)
-    for name in ("u", "delta", "z"):
-        their[name] = inputs[name].transpose(1, 2).contiguous()
-    for name in {"B", "C"} - {constant}:
-        their[name] = inputs[name].permute(0, 2, 3, 1).contiguous()
-    order = ("u", "delta", "A", "B", "C", "D", "z", "delta_bias")
-    out, last = selective_scan_fn(*(their[k] for k in order), True, True)
-    exact = {k: v.double() for k, v in inputs.items()}
-    if constant:
-        exact[constant] = exact[constant].expand(2, 33, 20, 5)
-    want, want_last = oracle(**exact, delta_softplus=True)
-    more = device_errors(oracle, exact, delta_softplus=True)
-    assert_rel_rms(out, want.transpose(1, 2), FORWARD + more["out"], "out")
-    assert_rel_rms(last, want_last, 2 * FORWARD + more["last"], "last state")
-
-
-def test_mamba_ssm_three_dimensional_matrices():
-    inputs = make(2, 9, 6, 3)
-    their = [inputs[k].transpose(1, 2) for k in ("u", "delta")]
-    matrices = [inputs[k][:, :, 0].transpose(1, 2) for k in ("B", "C")]
-    out = selective_scan_fn(*their, inputs["A"], *matrices, delta_softplus=True)
-    want = selective_scan(
-        **{k: inputs[k] for k in ("u", "delta", "A", "B", "C")}, delta_softplus=True
-    )
-    assert torch.equal(out.transpose(1, 2), want)
-    with pytest.raises(TypeError, match="complex"):
-        selective_scan_fn(*their, inputs["A"].to(torch.complex64), *matrices)
-
-
-def state_of(*shape):
-    inputs = make(*shape)
-    return {name: inputs[name] for name in STATE}
 
 
 @pytest.fixture(params=[2, 5])
@@ -372,21 +322,7 @@ def threads(request):
 @every_discretization
 @pytest.mark.parametrize("shape", [(2, 70, 35, 5, 1), (1, 1, 12, 3, 3), (1, 131, 80, 16, 2)])
 def test_state_matches_oracle(shape, discretization):
-    inputs = state_of(*shape)
-    options = {"delta_softplus": True, "discretization": discretization}
-    mine, theirs = leaves(inputs), leaves(inputs, torch.float64)
-    last, heads = (
-        selective_scan_state(**mine, **options),
-        [torch.randn(shape[0], *inputs["A"].shape)],
-    )
-
-    def exact(**tensors):
-        return oracle(C=torch.zeros_like(tensors["B"]), **tensors)[1:]
-
-    wants = exact(**theirs, **options)
-    more = device_errors(exact, inputs, heads, names=["last"], **options)
-    assert_rel_rms(last, wants[0], 1e-6 + more["last"], "last state")
-    assert_gradients((mine, [last]), (theirs, wants), 1e-5, heads=heads, more=more)
+    compare_state(make(*shape), discretization=discretization)
 
 
 def test_state_is_that_of_the_scan():
@@ -396,14 +332,8 @@ def test_state_is_that_of_the_scan():
     assert torch.equal(selective_scan_state(**alone, delta_softplus=True), last)
 
 
-def test_state_of_no_tokens_is_the_first():
-    inputs = state_of(2, 0, 5, 3)
-    got = selective_scan_state(**inputs, delta_softplus=True)
-    assert torch.equal(got, inputs["initial_state"])
-
-
 def test_state_refuses_bad_input():
-    inputs = state_of(1, 4, 5, 3)
+    inputs = {name: x for name, x in make(1, 4, 5, 3).items() if name in STATE}
     with pytest.raises(ValueError, match="initial_state must have shape"):
         selective_scan_state(**inputs | {"initial_state": torch.zeros(1, 5, 2)})
     with pytest.raises(TypeError, match="B must be a tensor, got NoneType"):

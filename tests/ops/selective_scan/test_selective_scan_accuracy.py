@@ -5,19 +5,13 @@ import math
 import pytest
 import torch
 import torch.nn.functional as F
-from helpers import assert_rel_rms
-from helpers.scan import compare, every_discretization, leaves, make, on_threads
+from helpers import assert_rel_rms, on_threads
+from helpers.scan import compare, every_discretization, leaves, make, of_squares
 
-from gamba_warp.kernels.selective_scan import selective_scan
-from gamba_warp.kernels.selective_scan.reference import (
-    EXACT,
-    Off,
-    discretize,
-    selective_scan_reference,
-)
+from gamba_warp.kernels.selective_scan import reference, selective_scan
+from gamba_warp.kernels.selective_scan.reference import EXACT, Off
 
 PIECE = 256
-SLOW = {"slow": -1e-6, "growing": 1e-6}  # kinds, and A of all states
 # CUDA has no other form for slow decays, and rounds each to float32 (CUDA.md, Exponential).
 ROUNDED = 2.0**-24
 TINY = 1e-30  # below, decays held at 2^-126 and numbers flushed to 0 are all that is seen
@@ -28,7 +22,7 @@ def oracle(
 ):
     """The scan in float64, pieces of tokens side by side: from 0, then from their first states."""
     step = F.softplus(delta + delta_bias, threshold=1e9) * (1 - off.step)
-    f, g = discretize(step[..., None] * A, discretization)
+    f, g = reference.discretize(step[..., None] * A, discretization)
     f = f * (1 - off.decay)
     w = g * (step * u)[..., None] * B
     pad = -u.shape[1] % PIECE
@@ -51,6 +45,28 @@ def oracle(
     return y * F.silu(z), last
 
 
+# Changes of a problem's inputs.
+KINDS = {
+    "random": lambda x: {},
+    "steps off": lambda x: {"delta": x["delta"] - 100},
+    "steps at 20": lambda x: {"delta": 20 - x["delta_bias"] + 1e-3 * x["delta"]},
+    "steps on": lambda x: {"delta": x["delta"] + 100},
+    "slow": lambda x: {"A": torch.full_like(x["A"], -1e-6)},
+    "growing": lambda x: {"A": torch.full_like(x["A"], 1e-6)},
+    # chunks with slow decays and chunks with others, in any order
+    "slow at times": lambda x: {"A": 1e-3 * x["A"], "delta": x["delta"] + 8 * turns(x, 150)},
+    "fast": lambda x: {"A": torch.full_like(x["A"], -1e4)},
+    "constant": lambda x: {name: torch.ones_like(x[name]) for name in "uB"},
+    "alternating": lambda x: {"u": 1 - 2 * turns(x, 1), "B": torch.ones_like(x["B"])},
+}
+
+
+def turns(x, tokens):
+    """0 for so many tokens, then 1, and so on; shaped as ``u``."""
+    odd = torch.arange(x["u"].shape[1]) // tokens % 2
+    return odd.float()[:, None].expand_as(x["u"]).contiguous()
+
+
 def problem(kind, length, channels=16, states=2):
     torch.manual_seed(0)
     inputs = make(1, length, channels, states)
@@ -58,34 +74,13 @@ def problem(kind, length, channels=16, states=2):
     inputs["delta_bias"] = bias + torch.log(-torch.expm1(-bias))
     inputs["delta"] = 0.5 * torch.randn(1, length, channels)
     inputs["A"] = -torch.arange(1.0, states + 1).repeat(channels, 1)
-    if kind == "steps off":
-        inputs["delta"] -= 100
-    elif kind == "steps at 20":
-        inputs["delta"] = 20 - inputs["delta_bias"] + 1e-3 * inputs["delta"]
-    elif kind == "steps on":
-        inputs["delta"] += 100
-    elif kind in SLOW:
-        inputs["A"] = torch.full_like(inputs["A"], SLOW[kind])
-    elif kind == "slow at times":  # chunks with slow decays and chunks with others, in any order
-        inputs["A"] *= 1e-3
-        inputs["delta"][:, torch.arange(length) // 150 % 2 == 1] += 8
-    elif kind == "fast":
-        inputs["A"] = torch.full_like(inputs["A"], -1e4)
-    elif kind == "denormal":
-        inputs["u"] *= 1e-39
-        inputs["initial_state"] *= 0
-    elif kind == "constant":
-        inputs["u"] = torch.ones_like(inputs["u"])
-        inputs["B"] = torch.ones_like(inputs["B"])
-    elif kind == "alternating":
-        inputs["u"] = torch.ones_like(inputs["u"])
-        inputs["u"][:, 1::2] = -1
-        inputs["B"] = torch.ones_like(inputs["B"])
-    return inputs
+    return inputs | KINDS[kind](inputs)
 
 
 def check(kind, length, threads):
-    gradient = 2e-6 if kind in SLOW else 1e-5  # measured below 1e-6; with f in float32 up to 4e-4
+    gradient = (
+        2e-6 if kind in ("slow", "growing") else 1e-5
+    )  # measured below 1e-6; with f in float32 up to 4e-4
     with on_threads(threads):
         limits = 1e-6, gradient, 1e-6
         compare(problem(kind, length), *limits, exact=oracle, tiny=TINY, decays=ROUNDED)
@@ -96,15 +91,13 @@ def test_oracle_is_the_reference(discretization):
     inputs = {k: v.double() for k, v in make(1, 600, 5, 3).items()}
     options = {"discretization": discretization, "off": Off(1e-3, 1e-4)}
     got, last = oracle(**inputs, **options)
-    want, want_last = selective_scan_reference(**inputs, delta_softplus=True, **options)
+    want, want_last = reference.selective_scan_reference(**inputs, delta_softplus=True, **options)
     assert_rel_rms(got, want, 1e-13, "out")
     assert_rel_rms(last, want_last, 1e-13, "last state")
 
 
 # On two threads these few channels are cut into segments, on one they are not.
 both = pytest.mark.parametrize("threads", [1, 2])
-KINDS = ("random", "steps off", "steps at 20", "steps on", *SLOW, "slow at times", "fast")
-KINDS += ("constant", "alternating")
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -154,10 +147,9 @@ def test_a_constant_input_beside_a_fast_channel(discretization, length, threads)
     to 3e-5, the gradients of delta and delta_bias up to 8e-5, at 4,003 tokens 2e-6 and 8e-6.
     """
     sums = (torch.ones_like, torch.zeros_like)
-    options = {"alone": True, "exact": oracle, "discretization": discretization}
-    options["decays"] = ROUNDED
+    options = {"exact": oracle, "discretization": discretization, "decays": ROUNDED}
     with on_threads(threads):
-        compare(constant(length), 5e-7, 3e-6, 5e-7, cotangents=sums, **options)
+        compare(constant(length), 5e-7, 3e-6, 5e-7, alone=True, cotangents=sums, **options)
 
 
 @every_discretization
@@ -173,11 +165,9 @@ def test_a_fast_channel_has_the_same_bits_beside_slow_ones(discretization):
                 inputs[name] = x[..., [3] * 16].contiguous()
         inputs["A"] = -torch.arange(1.0, 4.0).repeat(16, 1)
         inputs["initial_state"] = torch.ones(1, 16, 3)
-        mine = leaves(inputs)
-        out = selective_scan(**mine, delta_softplus=True, discretization=discretization)
-        grads = torch.autograd.grad(out.square().sum(), [mine[k] for k in ("u", "delta", "z")])
-        results.append([x[..., 15] for x in (out, *grads)])
-    assert all(torch.equal(a, b) for a, b in zip(*results))
+        found = dict(zip(("out", *inputs), of_squares(inputs, discretization=discretization)))
+        results.append([found[k][..., 15] for k in ("out", "u", "delta", "z")])
+    assert all(map(torch.equal, *results))
 
 
 def test_equal_terms_of_a_sum():
@@ -199,7 +189,10 @@ def test_zero_input_gives_zero():
 
 
 def test_denormal_input_stays_finite():
-    mine = leaves(problem("denormal", 1000))
+    inputs = problem("random", 1000)
+    inputs["u"] *= 1e-39
+    inputs["initial_state"].zero_()
+    mine = leaves(inputs)
     out = selective_scan(**mine, delta_softplus=True)
     assert torch.isfinite(out).all() and out.abs().max() < 1e-36
     for name, grad in zip(mine, torch.autograd.grad(out.sum(), [*mine.values()])):
