@@ -52,11 +52,50 @@ def mapped(scene, function):
     return {k: function(v) if isinstance(v, torch.Tensor) else v for k, v in scene.items()}
 
 
+def one(mean=(0.0, 0.0, 2.0), scale=0.1, opacity=0.8, size=(33, 31), focal=40.0):
+    """One round Gaussian before a camera at the origin."""
+    width, height = size
+    return dict(
+        means=torch.tensor([mean]),
+        quats=None,
+        scales=torch.full((1, 3), scale),
+        opacities=torch.tensor([opacity]),
+        colors=torch.tensor([[0.2, 0.5, 1.0]]),
+        viewmats=torch.eye(4)[None],
+        Ks=torch.tensor([[[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1.0]]]),
+        width=width,
+        height=height,
+    )
+
+
 def leaves(scene, dtype):
     """A copy of another dtype, in which every tensor but Ks requires a gradient."""
     scene = mapped(scene, lambda v: v.detach().to(dtype).clone().requires_grad_())
     scene["Ks"].requires_grad_(False)
     return scene
+
+
+def drawn(scene, mode="RGB", needs=NAMES, edit=lambda v: None, **options):
+    """Renders, alphas and gradients by name, under cotangents that repeat; the meta.
+
+    Args:
+        scene: of float32 tensors.
+        mode: of rendering.
+        needs: names of the inputs that require gradients.
+        edit: changes the cotangents of renders and alphas, a list, in place.
+        options: further ones of ``rasterization``.
+    """
+    tensors = leaves(scene, torch.float32)
+    asked = {k: tensors[k] for k in NAMES if tensors.get(k) is not None}
+    for name, tensor in asked.items():
+        tensor.requires_grad_(name in needs)
+    renders, alphas, meta = rasterization(**tensors, render_mode=mode, **options)
+    generator = torch.Generator().manual_seed(1)
+    v = [torch.randn(x.shape, generator=generator).to(x) for x in (renders, alphas)]
+    edit(v)
+    ((renders * v[0]).sum() + (alphas * v[1]).sum()).backward()
+    grads = {name: x.grad for name, x in asked.items() if x.grad is not None}
+    return {"renders": renders, "alphas": alphas, **grads}, meta
 
 
 def near_a_cut(scene, options):

@@ -3,27 +3,17 @@
 import pytest
 import torch
 from helpers.kernels import Watch
-from helpers.raster import crowded, leaves, make
+from helpers.raster import NAMES, crowded, drawn, leaves, make
 
-from gamba_warp.kernels.rasterize import (
-    depth_quantile,
-    forget_graphs,
-    lists_outgrown,
-    rasterization,
-)
+from gamba_warp.kernels import rasterize
+from gamba_warp.kernels.rasterize import depth_quantile, lists_outgrown, rasterization
 from gamba_warp.kernels.rasterize.cuda import capacity
 
 
-def render(scene, mode="RGB", **options):
+def render(scene, mode="RGB"):
     """Images, gradients and depth quantiles by name, and meta."""
-    g = torch.Generator().manual_seed(5)
-    tensors = leaves(scene, torch.float32)
-    renders, alphas, meta = rasterization(**tensors, render_mode=mode, **options)
-    v_renders, v_alphas = (torch.randn(x.shape, generator=g) for x in (renders, alphas))
-    wanted = {k: v for k, v in tensors.items() if getattr(v, "requires_grad", False)}
-    grads = torch.autograd.grad([renders, alphas], [*wanted.values()], [v_renders, v_alphas])
-    depths = depth_quantile(meta)
-    return {"renders": renders, "alphas": alphas, "depths": depths} | dict(zip(wanted, grads)), meta
+    found, meta = drawn(scene, mode)
+    return found | {"depths": depth_quantile(meta)}, meta
 
 
 @pytest.fixture
@@ -55,7 +45,7 @@ def test_too_many_pairs_for_a_graph(on_cuda, capturing):
     renders, alphas, meta = rasterization(**scene)
     assert meta.bins.pairs.numel() < meta["pairs"]
     assert renders.isnan().all() and alphas.isnan().all() and lists_outgrown()
-    forget_graphs()
+    rasterize.forget_graphs()
     renders, alphas, _ = rasterization(**scene)
     assert renders.isfinite().all() and alphas.isfinite().all() and not lists_outgrown()
 
@@ -98,15 +88,18 @@ def test_old_shapes_are_forgotten(monkeypatch):
         capacity.graph_capacity("a", torch.tensor([7]))
 
 
+@pytest.mark.usefixtures("each_device")
 @pytest.mark.parametrize("num, views, far", [(0, 2, False), (5, 0, False), (20, 2, True)])
-def test_nothing_to_see(on_cuda, num, views, far):
-    """No Gaussian, no view, or none that is seen."""
+def test_nothing_to_see(num, views, far):
+    """No Gaussian, no view, or none that is seen: the background alone, and no gradient."""
     scene = make(1, views, num=num, width=21, height=19)
     if far:
         scene["means"] += 1000.0
-    on_cuda(2)
     result, meta = render(scene)
-    assert not result["alphas"].any() and not result["means"].any()
-    assert result["alphas"].shape == (1, views, 19, 21, 1)
-    assert meta["pairs"] == 0 and meta["pairs_used"] == 0
+    assert result["alphas"].shape == (1, views, 19, 21, 1) and not result["alphas"].any()
+    ground = scene["backgrounds"][:, :, None, None].expand_as(result["renders"])
+    assert torch.equal(result["renders"], ground)
+    assert not any(result[name].any() for name in NAMES[:5])
+    assert meta["pairs"] == meta["pairs_used"] == meta["pairs_traversed"] == 0
     assert meta["tiles_empty"] == meta["tiles"] == 4 * views
+    assert sum(meta["culled"].values()) == num * views

@@ -4,21 +4,12 @@ import math
 
 import pytest
 import torch
+import torch.nn.functional as F
 from helpers import assert_rel_rms, assert_same_on_threads
 
-from gamba_warp.kernels.rasterize.harmonics import (
-    autograd,
-    colors_from_harmonics,
-    colors_seen_from,
-    cpu,
-    cuda,
-    sums_seen_from,
-)
-from gamba_warp.kernels.rasterize.harmonics.formula import (
-    colors_by_formula,
-    harmonics_basis,
-    sums_by_formula,
-)
+from gamba_warp.kernels.rasterize import harmonics
+from gamba_warp.kernels.rasterize.harmonics import autograd, colors_seen_from, cpu, cuda, formula
+from gamba_warp.kernels.rasterize.harmonics.formula import colors_by_formula
 
 NAMES = ("coefficients", "means", "centers")
 # float32 sums of up to 25 terms; the gradient by a centre adds up 300 Gaussians
@@ -28,30 +19,35 @@ FORWARD, GRADIENT = 3e-7, 1e-6
 @pytest.fixture(params=["cpu", "cuda"])
 def device(request, monkeypatch):
     """The kernels of both devices; those of CUDA have no blocks, so a CPU runs them as they are."""
-    monkeypatch.setattr(
-        autograd, "_kernels", lambda device: {"cpu": cpu, "cuda": cuda}[request.param]
-    )
-    return request.param
+    kernels = {"cpu": cpu, "cuda": cuda}[request.param]
+    monkeypatch.setattr(autograd, "_kernels", lambda device: kernels)
 
 
 def make(batch=2, views=3, num=37, extra=0, channels=3, degree=3, per_view=False):
     """Coefficients, means and centers; some colours are clamped."""
     lead = (batch, views) if per_view else (batch,)
+    shape = *lead, num, (degree + 1) ** 2 + extra, channels
     return {
-        "coefficients": 1.6
-        / (degree + 1)
-        * torch.randn(*lead, num, (degree + 1) ** 2 + extra, channels),
+        "coefficients": 1.6 / (degree + 1) * torch.randn(shape),
         "means": torch.randn(batch, num, 3),
         "centers": 2 * torch.randn(batch, views, 3),
     }
 
 
-def run(function, degree, inputs, v, dtype=torch.float32):
-    """The colours, and gradients by name under the cotangent v; None where there is none."""
+def run(function, degree, inputs, v=None, dtype=torch.float32):
+    """The colours, and gradients by name under v, or one that repeats; None where there is none."""
     inputs = {k: x.detach().to(dtype, copy=True).requires_grad_() for k, x in inputs.items()}
     colors = function(degree, *inputs.values())
-    grads = torch.autograd.grad(colors, list(inputs.values()), v.to(dtype), allow_unused=True)
+    if v is None:
+        v = torch.randn(colors.shape, generator=torch.Generator().manual_seed(1))
+    v = v.to(colors)
+    grads = torch.autograd.grad(colors, list(inputs.values()), v, allow_unused=True)
     return colors.detach(), dict(zip(inputs, grads))
+
+
+def both(degree, inputs, v=None):
+    """Those of the kernels and of the formula."""
+    return (run(f, degree, inputs, v) for f in (colors_seen_from, colors_by_formula))
 
 
 def check(degree, inputs, ours=colors_seen_from, oracle=colors_by_formula):
@@ -59,14 +55,12 @@ def check(degree, inputs, ours=colors_seen_from, oracle=colors_by_formula):
     shape = *inputs["centers"].shape[:2], inputs["means"].shape[1], inputs["coefficients"].shape[-1]
     v = torch.randn(shape)
     # where rounding decides whether a colour is clamped, the gradient is either
-    v[unclamped(degree, inputs).abs() < 1e-6] = 0
+    v[(terms(degree, inputs).sum(-2) + 0.5).abs() < 1e-6] = 0
     got, grads = run(ours, degree, inputs, v)
     want, expected = run(oracle, degree, inputs, v, torch.float64)
     # a colour is ½ more than its sum, whose terms are larger than itself
-    size = (
-        want.abs().max() if ours is colors_seen_from else terms(degree, inputs).abs().sum(-2).max()
-    )
-    assert (got - want).abs().max() <= FORWARD * size
+    size = want if ours is colors_seen_from else terms(degree, inputs).abs().sum(-2)
+    assert (got - want).abs().max() <= FORWARD * size.abs().max()
     for name in NAMES:
         if expected[name] is None:  # degree 0 does not see the direction
             assert degree == 0 and not grads[name].any(), name
@@ -75,20 +69,13 @@ def check(degree, inputs, ours=colors_seen_from, oracle=colors_by_formula):
     return want
 
 
-def unclamped(degree, inputs):
-    """½ + S before the clamp, in float64."""
-    return terms(degree, inputs).sum(-2) + 0.5
-
-
 def terms(degree, inputs):
     """Y_k c_k in float64, ``[B, V, N, K, D]``."""
     x = {k: v.double() for k, v in inputs.items()}
     used = x["coefficients"][..., : (degree + 1) ** 2, :]
     used = used if used.dim() == 5 else used[:, None]
-    directions = torch.nn.functional.normalize(
-        x["means"][:, None] - x["centers"][:, :, None], dim=-1
-    )
-    return harmonics_basis(degree, directions)[..., None] * used
+    directions = F.normalize(x["means"][:, None] - x["centers"][:, :, None], dim=-1)
+    return formula.harmonics_basis(degree, directions)[..., None] * used
 
 
 @pytest.mark.parametrize("per_view", [False, True])
@@ -104,10 +91,10 @@ def test_colours_and_gradients(device, degree, per_view):
 def test_bare_sums_and_gradients(device, degree, per_view):
     """Nothing is added and nothing clamped: sums below 0 stay, and pass their gradient on."""
     inputs = make(degree=degree, extra=1, per_view=per_view)
-    want = check(degree, inputs, sums_seen_from, sums_by_formula)
+    want = check(degree, inputs, harmonics.sums_seen_from, formula.sums_by_formula)
     assert 0.2 < (want < -0.1).double().mean() < 0.7
     inputs["means"][1, 5, 0] = math.nan
-    got, grads = run(sums_seen_from, degree, inputs, torch.randn(2, 3, 37, 3))
+    got, grads = run(harmonics.sums_seen_from, degree, inputs)
     assert got[1, :, 5].isnan().all() and got.isnan().sum() == 3 * 3
     assert all(g.isfinite().all() for g in grads.values())
 
@@ -142,8 +129,7 @@ def test_gradients_are_differences(degree):
 
 @pytest.mark.parametrize("name", NAMES)
 def test_a_gradient_alone_has_the_same_bits(device, name):
-    inputs = make()
-    v = torch.randn(2, 3, 37, 3)
+    inputs, v = make(), torch.randn(2, 3, 37, 3)
     _, every = run(colors_seen_from, 3, inputs, v)
     x = inputs[name].requires_grad_()
     (alone,) = torch.autograd.grad(colors_seen_from(3, *inputs.values()), x, v)
@@ -156,21 +142,19 @@ def test_a_gradient_alone_has_the_same_bits(device, name):
 def test_what_is_not_finite(device, degree, name, value):
     """Its colours are NaN and have no gradient; the others are as if it were not there."""
     inputs = make(degree=degree, extra=1, per_view=name == "coefficients")
-    v = torch.randn(2, 3, 37, 3)
-    want, expected = run(colors_seen_from, degree, inputs, v)
+    want, expected = run(colors_seen_from, degree, inputs)
     if name == "coefficients":
         inputs[name][1, 2, 5, (degree + 1) ** 2 - 1, 1] = value
         inputs[name][0, 0, 7, -1, 0] = value  # beyond the degree: not used
     else:
         inputs[name][1, 5, 2] = value
-    got, grads = run(colors_seen_from, degree, inputs, v)
+    (got, grads), (_, theirs) = both(degree, inputs)
     bad = torch.zeros(2, 3, 37, dtype=torch.bool)
     bad[1, 2 if name == "coefficients" else slice(None), 5] = True
     assert got[bad].isnan().all() and torch.equal(got[~bad], want[~bad])
     assert all(g.isfinite().all() for g in grads.values())
     none = grads["coefficients"][1, 2, 5] if name == "coefficients" else grads["means"][1, 5]
     assert not none.any()
-    theirs = run(colors_by_formula, degree, inputs, v)[1]
     for each in NAMES:
         if theirs[each] is not None:
             assert_rel_rms(grads[each], theirs[each], GRADIENT, each)
@@ -182,17 +166,14 @@ def test_sums_beyond_float32(device):
     inputs = make(1, 1, num=4, degree=1)
     inputs["coefficients"][0, 1] = 3.3e38
     inputs["means"][0, 1] = torch.tensor([-1.0, -1, 1]) + inputs["centers"][0, 0]
-    v = torch.randn(1, 1, 4, 3)
-    got, grads = run(colors_seen_from, 1, inputs, v)
-    want, expected = run(colors_by_formula, 1, inputs, v)
+    (got, grads), (want, expected) = both(1, inputs)
     assert torch.isinf(want).any() and torch.equal(got.isinf(), want.isinf())
     assert_rel_rms(grads["coefficients"], expected["coefficients"], GRADIENT, "coefficients")
 
 
 def test_a_centre_that_is_not_finite(device):
     """Its view is NaN and passes no gradient on; the other views keep theirs."""
-    inputs = make(1, 2)
-    v = torch.randn(1, 2, 37, 3)
+    inputs, v = make(1, 2), torch.randn(1, 2, 37, 3)
     inputs["centers"][0, 1, 0] = math.nan
     got, grads = run(colors_seen_from, 3, inputs, v)
     assert got[0, 1].isnan().all() and got[0, 0].isfinite().all()
@@ -207,7 +188,7 @@ def test_bare_sums_of_the_last_that_is_not_finite(device, name):
     """Nor do lanes without a Gaussian pass a gradient on."""
     inputs = make(1, 2)
     inputs[name][0, -1, 0] = math.nan
-    got, grads = run(sums_seen_from, 3, inputs, torch.randn(1, 2, 37, 3))
+    got, grads = run(harmonics.sums_seen_from, 3, inputs)
     assert got.isnan().any() and all(g.isfinite().all() for g in grads.values())
 
 
@@ -217,9 +198,7 @@ def test_no_direction(device, distance):
     inputs = make(1, 1, num=5, degree=4)
     inputs["centers"][:] = 0
     inputs["means"][0, 3] = distance
-    v = torch.randn(1, 1, 5, 3)
-    got, grads = run(colors_seen_from, 4, inputs, v)
-    want, expected = run(colors_by_formula, 4, inputs, v)
+    (got, grads), (want, expected) = both(4, inputs)
     assert (got - want).abs().max() < 1e-6
     for name in NAMES:
         assert_rel_rms(grads[name], expected[name], GRADIENT, name)
@@ -233,9 +212,7 @@ def test_the_clamp_at_zero(device):
     near = -0.5 / 0.28209479177387814 + 1.2e-7 * torch.arange(-4, 5)
     black = near[near * 0.28209479177387814 == -0.5][0].item()
     inputs["coefficients"][0, 0, 0] = torch.tensor([black, 1.001 * black, 0.0])
-    v = torch.ones(1, 1, 2, 3)
-    got, grads = run(colors_seen_from, 1, inputs, v)
-    want, expected = run(colors_by_formula, 1, inputs, v)
+    (got, grads), (want, expected) = both(1, inputs, torch.ones(1, 1, 2, 3))
     assert torch.equal(got, want) and got[0, 0, 0, 0] == 0 == got[0, 0, 0, 1]
     assert torch.equal(grads["coefficients"], expected["coefficients"])
     assert (grads["coefficients"][0, 0, 0] != 0).tolist() == [False, False, True]
@@ -261,9 +238,8 @@ def test_a_gradient_of_nan(device):
 def test_nothing_to_see():
     for batch, views, num in ((2, 0, 5), (2, 3, 0), (0, 1, 5)):
         inputs = make(batch, views, num=num)
-        v = torch.randn(batch, views, num, 3)
-        got, grads = run(colors_seen_from, 3, inputs, v)
-        assert got.shape == v.shape
+        got, grads = run(colors_seen_from, 3, inputs)
+        assert got.shape == (batch, views, num, 3)
         for name, g in grads.items():
             assert g.shape == inputs[name].shape and not g.any()
 
@@ -272,10 +248,9 @@ def test_nothing_to_see():
 def test_any_number_of_threads(per_view):
     """The same bits, twice and from one thread to four: 9 chunks of Gaussians."""
     inputs = make(1, 3, num=2100, per_view=per_view)
-    v = torch.randn(1, 3, 2100, 3)
 
     def made():
-        colors, grads = run(colors_seen_from, 3, inputs, v)
+        colors, grads = run(colors_seen_from, 3, inputs)
         return colors, *grads.values()
 
     assert_same_on_threads(made, 1, 2, 2, 4)
@@ -310,10 +285,10 @@ def test_once_differentiable():
 
 def test_the_compiler_and_meta_tensors():
     inputs = make(1, 2)
+    given = 3, True, *(x.requires_grad_() for x in inputs.values())
+    checks = ("test_schema", "test_faketensor", "test_autograd_registration")
     torch.library.opcheck(
-        torch.ops.gamba_warp.rasterize_harmonics.default,
-        (3, True, *(x.requires_grad_() for x in inputs.values())),
-        test_utils=("test_schema", "test_faketensor", "test_autograd_registration"),
+        torch.ops.gamba_warp.rasterize_harmonics.default, given, test_utils=checks
     )
     meta = colors_seen_from(3, *(x.to("meta") for x in inputs.values()))
     assert meta.shape == (1, 2, 37, 3) and meta.device.type == "meta"
@@ -327,14 +302,14 @@ def test_cameras_and_their_centres():
     viewmats[..., :3, :3] = rotation
     viewmats[..., :3, 3] = -(rotation @ inputs["centers"][..., None])[..., 0]
     viewmats.requires_grad_()
-    got = colors_from_harmonics(3, inputs["coefficients"], inputs["means"], viewmats)
+    got = harmonics.colors_from_harmonics(3, inputs["coefficients"], inputs["means"], viewmats)
     want = colors_seen_from(3, *inputs.values())
     assert (got - want).abs().max() < 1e-6
     v = torch.randn_like(got)
     got.backward(v)
     exact = viewmats.detach().double().requires_grad_()
     doubles = [inputs[k].double() for k in ("coefficients", "means")]
-    colors_from_harmonics(3, *doubles, exact).backward(v.double())
+    harmonics.colors_from_harmonics(3, *doubles, exact).backward(v.double())
     assert_rel_rms(viewmats.grad, exact.grad, GRADIENT, "viewmats")
 
 
@@ -342,11 +317,9 @@ def test_cameras_and_their_centres():
 @pytest.mark.parametrize("degree", [0, 1, 2, 3, 4])
 def test_on_a_gpu(degree):
     inputs = make(2, 3, num=300, degree=degree, extra=1)
-    v = torch.randn(2, 3, 300, 3)
-    want, expected = run(colors_seen_from, degree, inputs, v)
+    want, expected = run(colors_seen_from, degree, inputs)
     there = {k: x.cuda() for k, x in inputs.items()}
-    results = [run(colors_seen_from, degree, there, v.cuda()) for _ in range(2)]
-    (got, grads), (again, twice) = results
+    (got, grads), (again, twice) = (run(colors_seen_from, degree, there) for _ in range(2))
     assert torch.equal(got, again) and (got.cpu() - want).abs().max() < 1e-6 * want.max()
     for name in NAMES:
         assert torch.equal(grads[name], twice[name]), name

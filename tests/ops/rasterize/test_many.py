@@ -3,7 +3,7 @@
 import pytest
 import torch
 from helpers import on_threads
-from helpers.raster import NAMES, leaves, make
+from helpers.raster import drawn, make
 
 from gamba_warp.kernels.rasterize import Skip, autograd, rasterization
 from gamba_warp.kernels.rasterize.cpu import bin as bin_cpu
@@ -16,15 +16,12 @@ LISTS = ("pairs", "starts")
 
 
 def call(scene, **options):
-    """Renderings, gradients by name, and the lists; the gradient of the upper half alone."""
-    tensors = leaves(scene, torch.float32)
-    renders, alphas, meta = rasterization(**tensors, **options)
-    generator = torch.Generator().manual_seed(1)
-    v = [torch.randn(x.shape, generator=generator) for x in (renders, alphas)]
-    v[0][..., : renders.shape[-3] // 2, :, :] = 0
-    torch.autograd.backward([renders, alphas], v)
-    found = {name: tensors[name].grad for name in NAMES if tensors[name] is not None}
-    return {"renders": renders, "alphas": alphas, **found}, meta
+    """Renderings, gradients by name, and meta; the gradient of the lower half alone."""
+
+    def without_upper(v):
+        v[0][..., : v[0].shape[-3] // 2, :, :] = 0
+
+    return drawn(scene, edit=without_upper, **options)
 
 
 def assert_same(want, got):
@@ -54,7 +51,7 @@ def test_same_lists_images_and_gradients(monkeypatch, size, shape):
     assert assert_lists(monkeypatch, scene)["pairs"] > 100
 
 
-@pytest.mark.parametrize("options", [{"skip": Skip(tile_test=False)}, {"render_mode": "RGB+ED"}])
+@pytest.mark.parametrize("options", [{"skip": Skip(tile_test=False)}, {"mode": "RGB+ED"}])
 def test_same_with_options(monkeypatch, options):
     assert_lists(monkeypatch, make(1, 2, 200, 50, 70), **options)
 
@@ -104,10 +101,10 @@ def test_lists_are_in_order_of_depth_then_of_index(monkeypatch):
 def test_repeatable_with_any_number_of_threads(monkeypatch, many):
     monkeypatch.setattr(bin_cpu, "MANY", many)
     scene = make(2, 3, 400, 90, 61)
-    want = call(scene, render_mode="RGB+ED")
+    want = call(scene, mode="RGB+ED")
     for threads in (1, 2, 2, 5):
         with on_threads(threads):
-            assert_same(want, call(scene, render_mode="RGB+ED"))
+            assert_same(want, call(scene, mode="RGB+ED"))
 
 
 @pytest.mark.parametrize("mode", ["classic", "antialiased"])
@@ -122,15 +119,10 @@ def test_gradient_of_the_projection_on_lanes(monkeypatch, rotated, unused, mode)
     if not rotated:
         scene["quats"] = None
     scene["skip"] = Skip(unused=unused)
-    upstream = torch.randn(2, 3, 60, 45, 4)
     made = []
     for lanes in (LANES["cpu"], LANES["cuda"]):
         monkeypatch.setitem(LANES, "cpu", lanes)
-        tensors = leaves(scene, torch.float32)
-        tensors["viewmats"].requires_grad_()
-        renders = rasterization(**tensors, render_mode="RGB+ED", rasterize_mode=mode)[0]
-        renders.backward(upstream)
-        made.append({k: tensors[k].grad for k in NAMES if isinstance(tensors[k], torch.Tensor)})
+        made.append(drawn(scene, "RGB+ED", rasterize_mode=mode)[0])
     assert torch.equal(made[1]["viewmats"], made[0]["viewmats"])
     assert (made[0]["viewmats"] != 0).any()
     for name in ("means", "scales", "opacities", *(["quats"] if rotated else [])):

@@ -1,12 +1,13 @@
 """The rasterizer against its float64 oracle, with each skip on and off."""
 
-from dataclasses import fields, replace
+from dataclasses import fields
 
 import pytest
 import torch
 from helpers import assert_rel_rms
-from helpers.raster import GRADIENT, IMAGE, NAMES, compare, leaves, make, near_a_cut
+from helpers.raster import GRADIENT, IMAGE, NAMES, compare, drawn, leaves, make, near_a_cut
 
+from gamba_warp.kernels.cases import case
 from gamba_warp.kernels.cases.raster import LEAVES, orbit_cameras, shell
 from gamba_warp.kernels.rasterize import Skip, rasterization
 from gamba_warp.kernels.rasterize.harmonics import colors_from_harmonics
@@ -145,15 +146,13 @@ def test_faint_pixels(mode, alpha_min):
     assert got["colors"].grad is None or not got["colors"].grad.any()
 
 
-@pytest.mark.parametrize("cuda", [False, True])
-def test_the_background_behind_almost_opaque_pixels(on_cuda, cuda):
+@pytest.mark.usefixtures("each_device")
+def test_the_background_behind_almost_opaque_pixels():
     """Its weight is T = 2e-4, of which 1 - alpha would have lost four digits."""
     scene = make(1, 1, num=7, width=21, height=18)
     scene["means"] *= 0.1
     scene["scales"][:], scene["opacities"][:] = 1e3, 0.7  # every pixel alike: no error averages out
     got, want = leaves(scene, torch.float32), leaves(scene, torch.float64)
-    if cuda:
-        on_cuda()
     renders, alphas, _ = rasterization(**got)
     expected, _, alpha = rasterization_reference(**want)
     assert (1e-4 < 1 - alpha).all() and (1 - alpha < 3e-4).all()
@@ -188,9 +187,8 @@ def test_fake_results_have_the_real_shapes():
     limits = Limits(alpha_min=1 / 255, alpha_max=0.99, t_min=1e-4)
     given = list(meta.bins), None, None, *size, *limits
     arguments = (means2d, conics, opacities, torch.rand(num, 3), *given)
-    torch.library.opcheck(
-        torch.ops.gamba_warp.rasterize_composite.default, arguments, test_utils=checks
-    )
+    operator = torch.ops.gamba_warp.rasterize_composite.default
+    torch.library.opcheck(operator, arguments, test_utils=checks)
 
 
 def test_a_compiled_call_has_the_same_bits():
@@ -216,37 +214,19 @@ WIDTH, HEIGHT, VIEWS = 150, 139, 2
 SKIPS = [field.name for field in fields(Skip)]
 
 
-def render(skip=None, wanted=LEAVES, mode="classic"):
+def render(mode="classic", **off):
     """An opaque shell, much of it hidden, empty tiles around it, no gradient on the right half."""
-    torch.manual_seed(0)
-    gaussians = {k: x.clone() for k, x in shell(6000, 3).items()}
-    gaussians["opacities"][::5] = 0.004  # touches almost nothing
-    gaussians["opacities"].clamp_(max=0.98)
-    viewmats, Ks = orbit_cameras(VIEWS, 128)
-    inputs = {k: x.requires_grad_(k in wanted) for k, x in gaussians.items()}
-    options = {} if skip is None else {"skip": skip}
-    renders, alphas, meta = rasterization(
-        **inputs,
-        viewmats=viewmats,
-        Ks=Ks,
-        width=WIDTH,
-        height=HEIGHT,
-        rasterize_mode=mode,
-        **options,
-    )
-    v, w = torch.randn_like(renders), torch.randn_like(alphas)
-    v[:, :, 64:] = w[:, :, 64:] = 0
-    gradients = torch.autograd.grad([renders, alphas], [inputs[k] for k in wanted], [v, w])
-    return dict(zip(("image", "alpha", *wanted), (renders, alphas, *gradients))), meta
+    scene = shell(6000, 3)
+    scene["opacities"][::5] = 0.004  # touches almost nothing
+    scene["opacities"].clamp_(max=0.98)
+    scene["viewmats"], scene["Ks"] = orbit_cameras(VIEWS, 128)
+    scene |= {"width": WIDTH, "height": HEIGHT}
 
+    def without_right(v):
+        for x in v:
+            x[:, :, 64:] = 0
 
-def close(got, want):
-    """Equal to rounding: 1e-6 of the largest value."""
-    assert got.keys() == want.keys()
-    return {
-        k: float((got[k] - want[k]).detach().abs().max() / want[k].detach().abs().max())
-        for k in want
-    }
+    return drawn(scene, needs=LEAVES, edit=without_right, rasterize_mode=mode, skip=Skip(**off))
 
 
 def test_default_is_every_skip():
@@ -257,19 +237,20 @@ def test_default_is_every_skip():
 @pytest.mark.parametrize("mode", ["classic", "antialiased"])
 @pytest.mark.parametrize("name", [*SKIPS, "all of them"])
 def test_same_with_and_without(name, mode):
-    want, counts = render(mode=mode)
-    assert want["image"].mean() > 0.1 and counts["tiles_empty"] > 5
-    off = {name: False} if name in SKIPS else dict.fromkeys(SKIPS, False)
-    got, _ = render(replace(Skip(), **off), mode=mode)
-    errors = close(got, want)
-    assert max(errors.values()) < 1e-6, errors
+    want, counts = render(mode)
+    assert want["renders"].mean() > 0.1 and counts["tiles_empty"] > 5
+    off = dict.fromkeys([name] if name in SKIPS else SKIPS, False)
+    got, _ = render(mode, **off)
+    assert got.keys() == want.keys()
+    error = case.compare(got, want)
+    assert error.maximum < 1e-6, error
 
 
 def test_counts_tell_what_each_leaves_out():
     got, on = render()
     assert (got["means"].abs().sum(1) == 0).sum() > 50  # those that are hidden
     tiles = on["tiles"] - on["tiles_empty"]
-    metas = {name: render(replace(Skip(), **{name: False}))[1] for name in SKIPS}
+    metas = {name: render(**{name: False})[1] for name in SKIPS}
     assert metas["tile_test"]["pairs"] == on["pairs_box"] > on["pairs"]
     assert metas["block_test"]["blocks_traversed"] > 1.5 * on["blocks_traversed"]
     assert metas["stopped"]["pairs_traversed"] == on["pairs"] > on["pairs_traversed"]

@@ -1,6 +1,5 @@
 """The CUDA path executed from PTX beside the CPU's, and what skips change."""
 
-from dataclasses import fields
 from functools import partial
 from pathlib import Path
 
@@ -8,7 +7,7 @@ import pytest
 import torch
 import warp as wp
 from helpers import assert_rel_rms
-from helpers.raster import crowded, leaves, make
+from helpers.raster import crowded, drawn, make, mapped
 
 from gamba_warp.kernels.rasterize import Skip, api, rasterization
 from gamba_warp.kernels.rasterize.constants import ALPHA_MAX, ALPHA_MIN, T_MIN
@@ -35,11 +34,13 @@ def absolute_gradients(monkeypatch):
 
 
 SAME = 2e-6  # the two sum in another order
+COUNTS = ("pairs_traversed", "blocks_traversed", "blocks_used", "tiles_skipped")
 
 
-def upstream(channels=3):
-    """Gradients of two images of 37 x 21 and of their alphas."""
-    return torch.randn(1, 2, 21, 37, channels), torch.randn(1, 2, 21, 37, 1)
+def run(scene, mode="RGB", **options):
+    """As ``drawn``, with those of meta's counts that depend on the kernels."""
+    found, meta = drawn(scene, mode, **options)
+    return found, {name: meta[name] for name in COUNTS}
 
 
 def assert_same(got, want):
@@ -49,29 +50,26 @@ def assert_same(got, want):
         assert_rel_rms(got[name], value, SAME, name)
 
 
-def run(scene, v_renders, v_alphas, mode="RGB", needs=None, **options):
-    """Images and gradients by name, and counts; only ``needs`` get gradients, or all."""
-    tensors = leaves(scene, torch.float32)
-    for name, value in tensors.items():
-        if needs is not None and isinstance(value, torch.Tensor) and name not in needs:
-            value.requires_grad_(False)
-    renders, alphas, meta = rasterization(**tensors, render_mode=mode, **options)
-    ((renders * v_renders).sum() + (alphas * v_alphas).sum()).backward()
-    grads = {k: v.grad for k, v in tensors.items() if getattr(v, "grad", None) is not None}
-    counts = {
-        k: meta[k] for k in ("pairs_traversed", "blocks_traversed", "blocks_used", "tiles_skipped")
-    }
-    return {"renders": renders, "alphas": alphas, **grads}, counts
+def on_both(on_cuda, parts, scene, *mode, **options):
+    """Results on CUDA, which are those of the CPU; the counts of CUDA and of the CPU."""
+    lanes, of_lanes = run(scene, *mode, **options)
+    on_cuda(parts)
+    blocks, of_blocks = run(scene, *mode, **options)
+    assert_same(blocks, lanes)
+    return blocks, of_blocks, of_lanes
+
+
+def without_a_tile(v):
+    """No gradient in a tile, and in a sub-tile of another."""
+    for x in v:
+        x[:, :, :16, :16] = x[:, :, :4, 16:24] = 0
 
 
 def test_skips_change_nothing(on_cuda):
     scene = crowded(3)
-    v_renders, v_alphas = upstream()
-    v_renders[:, :, :16, :16] = v_alphas[:, :, :16, :16] = 0
     on_cuda(2)
-    want, counts = run(scene, v_renders, v_alphas)
-    off = dict.fromkeys([field.name for field in fields(Skip)], False)
-    got, all_counts = run(scene, v_renders, v_alphas, skip=Skip(**off))
+    want, counts = run(scene, edit=without_a_tile)
+    got, all_counts = run(scene, edit=without_a_tile, skip=Skip.from_bits(0))
     assert_same(got, want)
     assert all_counts["pairs_traversed"] > counts["pairs_traversed"]
     assert all_counts["tiles_skipped"] < counts["tiles_skipped"]
@@ -83,16 +81,9 @@ def test_skips_change_nothing(on_cuda):
     [(3, "RGB", 1), (3, "RGB+ED", 2), (6, "RGB", 1), (5, "RGB", 4), (2, "RGB", 2), (1, "ED", 4)],
 )
 def test_block_kernels_equal_lane_kernels(on_cuda, channels, mode, parts):
-    scene = crowded(channels)
-    size = channels + ("+" in mode) if mode != "ED" else 1
-    v_renders, v_alphas = upstream(size)
-    v_renders[:, :, :16, :16] = v_alphas[:, :, :16, :16] = 0  # a tile without gradient
-    v_renders[:, :, :4, 16:24] = v_alphas[:, :, :4, 16:24] = 0  # and a sub-tile
-    lanes, lane_counts = run(scene, v_renders, v_alphas, mode)
-    on_cuda(parts)
-    blocks, block_counts = run(scene, v_renders, v_alphas, mode)
-    assert lanes["alphas"].mean() > 0.3
-    assert_same(blocks, lanes)
+    found = on_both(on_cuda, parts, crowded(channels), mode, edit=without_a_tile)
+    blocks, block_counts, lane_counts = found
+    assert blocks["alphas"].mean() > 0.3
     # the CPU counts blocks of which only pixels outside the image are covered
     used, lanes_used = block_counts.pop("blocks_used"), lane_counts.pop("blocks_used")
     assert 0.99 * lanes_used <= used <= lanes_used
@@ -107,16 +98,11 @@ def test_absolute_gradients(monkeypatch, on_cuda, channels, parts, passes):
     """Also with more channels than one launch has, and of a gradient that passes the clamp."""
     monkeypatch.setattr(api, "Limits", partial(Limits, straight_through=passes))
     scene = crowded(channels)
-    given = scene, *upstream(channels)
-    plain, _ = run(*given)
+    plain, _ = run(scene)
     found = absolute_gradients(monkeypatch)
-    lanes, _ = run(*given)
-    for name, value in plain.items():
-        assert torch.equal(lanes[name], value), f"{name} is that without absolute values"
-    on_cuda(parts)
-    blocks, _ = run(*given)
-    assert_same(blocks, lanes)
-    assert_rel_rms(found[-1], found[0], SAME, "absolute")
+    blocks, *_ = on_both(on_cuda, parts, scene)
+    assert_same(blocks, plain)
+    assert_rel_rms(found[1], found[0], SAME, "absolute")
     assert (found[0] > 0).all(-1).float().mean() > 0.5
 
 
@@ -134,37 +120,27 @@ def test_counts_in_front_of_the_median(on_cuda):
 @pytest.mark.parametrize("parts", [1, 2])
 def test_colours_alone(on_cuda, parts):
     """Another kernel, without moments."""
-    scene = crowded(3)
-    v_renders, v_alphas = upstream()
-    lanes, _ = run(scene, v_renders, v_alphas, needs=["colors"])
-    on_cuda(parts)
-    blocks, _ = run(scene, v_renders, v_alphas, needs=["colors"])
+    blocks, *_ = on_both(on_cuda, parts, crowded(3), needs=["colors"])
     assert set(blocks) == {"renders", "alphas", "colors"}
-    assert_same(blocks, lanes)
 
 
 @pytest.mark.parametrize("first, parts", [(0, 1), (4, 4)])
 def test_a_chunk_without_gradients(on_cuda, first, parts):
     """Its launch writes nothing to the rows that the other one writes."""
-    scene = crowded(5)
-    v_renders, v_alphas = upstream(5)
-    v_renders[..., first : first + 4] = 0
-    lanes, _ = run(scene, v_renders, v_alphas * (first > 0))
-    on_cuda(parts)
-    blocks, _ = run(scene, v_renders, v_alphas * (first > 0))
-    assert_same(blocks, lanes)
+
+    def without_a_chunk(v):
+        v[0][..., first : first + 4] = 0
+        v[1] *= first > 0
+
+    on_both(on_cuda, parts, crowded(5), edit=without_a_chunk)
 
 
 def test_too_faint_to_change_a_transmittance(on_cuda):
     """Pixels that no Gaussian reached are known by T = 1, but not among such Gaussians."""
     scene = crowded(3)
     scene["opacities"] = 1e-8 * (1 + torch.rand_like(scene["opacities"]))
-    v = upstream()
-    lanes, _ = run(scene, *v, alpha_min=5e-9)
-    on_cuda()
-    blocks, _ = run(scene, *v, alpha_min=5e-9)
-    assert (lanes["alphas"] == 0).all() and (lanes["colors"] != 0).float().mean() > 0.5
-    assert_same(blocks, lanes)
+    blocks, *_ = on_both(on_cuda, 1, scene, alpha_min=5e-9)
+    assert (blocks["alphas"] == 0).all() and (blocks["colors"] != 0).float().mean() > 0.5
 
 
 def test_without_dilation(on_cuda):
@@ -172,49 +148,40 @@ def test_without_dilation(on_cuda):
     scene = crowded(3)
     scene["scales"][:, ::6] = torch.tensor([0.1, 0, 0])
     scene["scales"][:, 1::6] = 1e-13
-    v = upstream()
-    lanes, lane_counts = run(scene, *v, eps2d=0.0)
-    on_cuda()
-    blocks, block_counts = run(scene, *v, eps2d=0.0)
+    blocks, counts, lane_counts = on_both(on_cuda, 1, scene, eps2d=0.0)
     assert all(x.isfinite().all() for x in blocks.values())
     assert all((blocks[name][:, k::6] == 0).all() for name in ("means", "scales") for k in (0, 1))
-    assert blocks["alphas"].mean() > 0.3 and block_counts["pairs_traversed"] > 0
-    assert_same(blocks, lanes)
-    assert block_counts["pairs_traversed"] == lane_counts["pairs_traversed"]
+    assert blocks["alphas"].mean() > 0.3
+    assert counts["pairs_traversed"] == lane_counts["pairs_traversed"] > 0
 
 
 def test_a_first_gaussian_may_stop_a_pixel(on_cuda):
     """Then its transmittance is still 1, as that of no pixel outside the image may be."""
     scene = make(1, 1, num=40, width=21, height=19, channels=3, size=60.0)
     scene["opacities"][:] = 0.999999
-    options = dict(alpha_max=0.999999)
-    v_renders, v_alphas = torch.randn(1, 1, 19, 21, 3), torch.randn(1, 1, 19, 21, 1)
-    lanes, lane_counts = run(scene, v_renders, v_alphas, **options)
-    on_cuda()
-    blocks, block_counts = run(scene, v_renders, v_alphas, **options)
+    blocks, counts, lane_counts = on_both(on_cuda, 1, scene, alpha_max=0.999999)
     # a sub-tile is two blocks
-    assert 0 < block_counts.pop("blocks_traversed") <= lane_counts.pop("blocks_traversed")
-    assert (lanes["alphas"] == 0).any() and block_counts == lane_counts
-    assert_same(blocks, lanes)
+    assert 0 < counts.pop("blocks_traversed") <= lane_counts.pop("blocks_traversed")
+    assert (blocks["alphas"] == 0).any() and counts == lane_counts
 
 
 def test_a_gradient_of_nan_is_not_zero(on_cuda):
-    scene = crowded(3)
-    v_renders, v_alphas = torch.zeros(1, 2, 21, 37, 3), torch.zeros(1, 2, 21, 37, 1)
-    v_renders[:, :, 5, 5, 1] = torch.nan
+    def one_nan(v):
+        v[0].zero_()
+        v[1].zero_()
+        v[0][:, :, 5, 5, 1] = torch.nan
+
     on_cuda()
-    result, _ = run(scene, v_renders, v_alphas)
+    result, _ = run(crowded(3), edit=one_nan)
     assert result["colors"][..., 1].isnan().any()
 
 
 def test_two_runs_and_any_parts(on_cuda):
     """The same bits twice; images do not depend on the parts, gradients by rounding only."""
-    scene = crowded(3)
-    v_renders, v_alphas = upstream()
-    results = []
+    scene, results = crowded(3), []
     for parts in (1, 1, 4):
         on_cuda(parts)
-        results.append(run(scene, v_renders, v_alphas))
+        results.append(run(scene))
     (first, counts), (second, _), (cut, cut_counts) = results
     assert counts == cut_counts
     for name, value in first.items():
@@ -289,10 +256,9 @@ def test_no_sub_tile_is_missed(from_ptx, longest):
 def test_on_a_gpu(monkeypatch, parts):
     monkeypatch.setattr(composite_cuda, "parts_of_tile", lambda tiles, device: parts)
     scene = make(2, 3, num=300, width=75, height=53)
-    v_renders, v_alphas = torch.randn(2, 3, 53, 75, 4), torch.randn(2, 3, 53, 75, 1)
-    want, _ = run(scene, v_renders, v_alphas, "RGB+D")
-    scene = {k: v.cuda() if isinstance(v, torch.Tensor) else v for k, v in scene.items()}
-    results = [run(scene, v_renders.cuda(), v_alphas.cuda(), "RGB+D")[0] for _ in range(2)]
+    want, _ = run(scene, "RGB+D")
+    there = mapped(scene, torch.Tensor.cuda)
+    results = [run(there, "RGB+D")[0] for _ in range(2)]
     for name, value in want.items():
         # the exponential is an approximation there; a few pixels cross the cut at alpha_min
         assert_rel_rms(results[0][name].cpu(), value, 1e-3, name)
