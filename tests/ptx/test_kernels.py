@@ -9,14 +9,12 @@ from helpers import raster as rasters
 from helpers import scan as scans
 from helpers.kernels import conv_inputs
 from helpers.model import SMALLEST, inputs
+from ops.causal_conv1d import test_causal_conv1d as conv
+from ops.rasterize import test_harmonics as harmonics
 
 from gamba_warp.cameras import Cameras
-from gamba_warp.kernels.causal_conv1d import causal_conv1d
-from gamba_warp.kernels.causal_conv1d.reference import causal_conv1d_reference
 from gamba_warp.kernels.rasterize import depth_quantile
 from gamba_warp.kernels.rasterize.cuda.bin import bin_views
-from gamba_warp.kernels.rasterize.harmonics import colors_seen_from
-from gamba_warp.kernels.rasterize.harmonics.formula import colors_by_formula
 from gamba_warp.kernels.rasterize.projection import Projected
 from gamba_warp.kernels.rasterize.skip import TILE_TEST
 from gamba_warp.kernels.rasterize.tiles import Tiling, make_grid
@@ -64,23 +62,19 @@ SEGMENTS = Tuning(segments=3, back_segments=2)
 )
 def test_scan(monkeypatch, shape, options, tuning):
     monkeypatch.setattr(scan_cuda, "choose", lambda *_: tuning)
-    options = dict(options)
-    dtype = options.pop("dtype", torch.float32)
+    dtype = options.get("dtype", torch.float32)
     forward = scans.FORWARD if dtype == torch.float32 else HALF
-    check(lambda: scans.compare(scans.make(*shape, dtype=dtype), forward, **options))
+    rest = {name: x for name, x in options.items() if name != "dtype"}
+    check(lambda: scans.compare(scans.make(*shape, dtype=dtype), forward, **rest))
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.bfloat16])
 def test_convolution(dtype):
+    limits = () if dtype == torch.float32 else (HALF, HALF)
+
     def run():
         for shape in ((2, 300, 19, 4), (1, 33, 130, 3), (1, 1, 1, 2)):
-            inputs = conv_inputs(*shape, dtype)
-            exact, mine = scans.leaves(inputs, torch.float64), scans.leaves(inputs)
-            out, _ = causal_conv1d_reference(**exact, activation="silu")
-            got = causal_conv1d(**mine, activation="silu")
-            half = dtype != torch.float32
-            assert_rel_rms(got, out, HALF if half else 2e-7, "out")
-            scans.assert_gradients((mine, [got]), (exact, [out]), HALF if half else 2e-6, HALF)
+            conv.compare(conv_inputs(*shape, dtype), "silu", *limits)
 
     check(run)
 
@@ -123,23 +117,7 @@ def test_sizes():
 
 @pytest.mark.parametrize("degree", [0, 3])
 def test_harmonics(degree):
-    def run():
-        means, centers = torch.randn(2, 300, 3), 3 * torch.randn(2, 3, 3)
-        inputs = {"coefficients": torch.randn(2, 300, (degree + 1) ** 2, 3)}
-        inputs |= {"means": means, "centers": centers}
-        mine, exact = scans.leaves(inputs), scans.leaves(inputs, torch.float64)
-        got = colors_seen_from(degree, *mine.values())
-        want = colors_by_formula(degree, *exact.values())
-        assert_rel_rms(got, want, 3e-7, "colors")
-        # where a colour is clamped to within rounding, its gradient is either
-        v = torch.randn_like(got) * ((want == 0) == (got == 0))
-        grads = torch.autograd.grad(got, [*mine.values()], v, allow_unused=True)
-        wants = torch.autograd.grad(want, [*exact.values()], v.double(), allow_unused=True)
-        for name, x, y in zip(inputs, grads, wants):
-            if degree or name == "coefficients":
-                assert_rel_rms(x, y, 1e-6, name)
-
-    check(run)
+    check(lambda: harmonics.check(degree, harmonics.make(num=300, degree=degree)))
 
 
 def test_only_one_kernel_contracts():

@@ -10,17 +10,8 @@ from helpers.refusals import refused_command
 
 from gamba_warp import cli
 from gamba_warp.commands import machine
-from gamba_warp.kernels.bench import conv, raster, scan
-from gamba_warp.kernels.bench.measure import (
-    LEVELS,
-    Level,
-    NotInstalled,
-    Settings,
-    Table,
-    Variant,
-    measure,
-    pair,
-)
+from gamba_warp.kernels.bench import conv, measure, raster, scan
+from gamba_warp.kernels.bench.measure import NotInstalled, Table
 from gamba_warp.kernels.bench.report import markdown
 from gamba_warp.kernels.cases import conv as conv_cases
 from gamba_warp.kernels.cases import scan as scan_cases
@@ -30,7 +21,7 @@ from gamba_warp.kernels.cases.scan import make_inputs, scan_case
 from gamba_warp.kernels.selective_scan.reference import selective_scan_reference
 from gamba_warp.measure import models
 
-QUICK = Settings(torch.device("cpu"), "quick", threads=1)
+QUICK = measure.Settings(torch.device("cpu"), "quick", threads=1)
 # DESIGN's schema, and what it leaves to us.
 SCHEMA = set(
     "op case variant device dtype direction ms_p20 ms_p50 ms_p80 jit_ms rel_rms_error max_error "
@@ -42,13 +33,15 @@ TIMES = ("ms_p20", "ms_p50", "ms_p80", "cpu_ms", "jit_ms")
 @pytest.fixture(autouse=True)
 def _three_rounds(monkeypatch):
     """Three rounds of everything; torch's threads as before."""
-    monkeypatch.setitem(LEVELS, "quick", Level(0.0, 3, 3))
+    monkeypatch.setitem(measure.LEVELS, "quick", measure.Level(0.0, 3, 3))
     with on_threads(torch.get_num_threads()):
         yield
 
 
 def variant(name="ours", run=lambda: None, error=1e-8, **options):
-    return Variant(name, run, lambda: Error(error, error, "out"), oracle="a loop", **options)
+    return measure.Variant(
+        name, run, lambda: Error(error, error, "out"), oracle="a loop", **options
+    )
 
 
 def case(*variants, name="one", op="scan"):
@@ -56,12 +49,13 @@ def case(*variants, name="one", op="scan"):
 
 
 def run(*cases):
-    return measure(cases, QUICK)
+    return measure.measure(cases, QUICK)
 
 
 def measured(suite, name, settings=QUICK):
     """Return the records of the case of that name."""
-    return measure([c for c in suite.tables(settings) if c.name == name], settings)["records"]
+    found = [c for c in suite.tables(settings) if c.name == name]
+    return measure.measure(found, settings)["records"]
 
 
 def stub(monkeypatch, *cases):
@@ -126,7 +120,7 @@ def test_a_wrong_kernel_is_caught(monkeypatch):
         made = scan_case(inputs, cpu, 40)
         silu = conv_cases.silu if right else off(conv_cases.silu, 3)
         other = conv_cases.conv_case(cpu, (1, 30, 8, 4), silu)
-        records = run(case(*pair(made, "x"), *pair(other, "y")))["records"]
+        records = run(case(*measure.pair(made, "x"), *measure.pair(other, "y")))["records"]
         assert len(records) == 4 and all(r["status"].startswith(status) for r in records)
 
 

@@ -6,7 +6,7 @@ from unittest.mock import patch
 import pytest
 import torch
 from helpers import on_threads
-from helpers.kernels import conv_inputs
+from helpers.kernels import conv_inputs as unpacked
 from helpers.scan import gradients, leaves, make
 
 from gamba_warp.kernels.causal_conv1d import causal_conv1d, causal_conv1d_fn
@@ -26,6 +26,11 @@ def borders(lengths):
 def scan_inputs(lengths, channels, states, groups=1, dtype=torch.float32):
     inputs = make(1, sum(lengths), channels, states, groups, dtype)
     return inputs | {"initial_state": torch.randn(len(lengths), channels, states)}
+
+
+def conv_inputs(lengths, channels, width):
+    inputs = unpacked(1, sum(lengths), channels, width)
+    return inputs | {"initial_state": torch.randn(len(lengths), width - 1, channels)}
 
 
 def assert_as_alone(function, inputs, lengths, limit):
@@ -98,8 +103,8 @@ def test_scan_on_cuda_of_long_sequences(from_ptx):
 
 def test_borders_that_nobody_looks_at_are_bounded(from_ptx):
     """On CUDA and under torch.compile: those that fall end an empty sequence, none overlap."""
-    inputs = scan_inputs([70, 0, 60, 0], 5, 3)
-    tokens = conv_inputs(1, 130, 5, 4) | {"initial_state": torch.randn(4, 3, 5)}
+    lengths = [70, 0, 60, 0]
+    inputs, tokens = scan_inputs(lengths, 5, 3), conv_inputs(lengths, 5, 4)
     from_ptx()
     results = []
     with patch.object(torch.compiler, "_is_compiling_flag", True):
@@ -126,19 +131,14 @@ def test_scan_in_segments(channels, states, threads):
         assert_as_alone(scan, scan_inputs(lengths, channels, states), lengths, 1e-5)
 
 
-@pytest.mark.parametrize("device", ["cpu", "ptx"])
+@pytest.mark.usefixtures("each_device")
 @pytest.mark.parametrize("channels, width", [(5, 2), (37, 3), (16, 4)])
-def test_convolution(channels, width, device, from_ptx):
-    inputs = conv_inputs(1, sum(LENGTHS), channels, width)
-    inputs["initial_state"] = torch.randn(len(LENGTHS), width - 1, channels)
-    if device == "ptx":
-        from_ptx()
-    assert_as_alone(conv, inputs, LENGTHS, 1e-5)
+def test_convolution(channels, width):
+    assert_as_alone(conv, conv_inputs(LENGTHS, channels, width), LENGTHS, 1e-5)
 
 
 def test_state_alone_and_no_state():
-    inputs = scan_inputs([3, 0, 70], 7, 4)
-    cuts = borders([3, 0, 70])
+    inputs, cuts = scan_inputs([3, 0, 70], 7, 4), borders([3, 0, 70])
     _, last = scan(**inputs, cu_seqlens=cuts)
     rest = {k: v for k, v in inputs.items() if k not in ("C", "D", "z")}
     assert torch.equal(selective_scan_state(**rest, delta_softplus=True, cu_seqlens=cuts), last)
@@ -148,42 +148,34 @@ def test_state_alone_and_no_state():
     assert all(map(torch.equal, scan(**rest, cu_seqlens=cuts), with_zeros))
 
 
-@pytest.mark.parametrize("cuts", [[0], [0, 0], [0, 0, 0]])
-def test_no_tokens(cuts):
-    count = len(cuts) - 1
-    cuts = torch.tensor(cuts, dtype=torch.int64)
-    inputs = make(1, 0, 5, 3) | {"initial_state": torch.randn(count, 5, 3)}
-    out, last = scan(**inputs, cu_seqlens=cuts)
-    assert out.shape == (1, 0, 5) and torch.equal(last, inputs["initial_state"])
-    inputs = conv_inputs(1, 0, 5, 4) | {"initial_state": torch.randn(count, 3, 5)}
-    out, final = conv(**inputs, cu_seqlens=cuts)
-    assert out.shape == (1, 0, 5) and torch.equal(final, inputs["initial_state"])
+@pytest.mark.parametrize("lengths", [[], [0], [0, 0]])
+def test_no_tokens(lengths):
+    cases = (scan, scan_inputs(lengths, 5, 3)), (conv, conv_inputs(lengths, 5, 4))
+    for function, inputs in cases:
+        out, last = function(**inputs, cu_seqlens=borders(lengths).long())
+        assert out.shape == (1, 0, 5) and torch.equal(last, inputs["initial_state"])
 
 
 def test_numbers_of_sequences():
     """``seq_idx`` of two rows says what ``cu_seqlens`` says of one; numbers may have gaps."""
     rows = [[4, 1, 70], [60, 15]]
     seq_idx = torch.stack(
-        [torch.arange(len(r)).mul(3).repeat_interleave(torch.tensor(r)) for r in rows]
-    ).int()
+        [3 * torch.arange(len(r)).repeat_interleave(torch.tensor(r)) for r in rows]
+    )
+    cuts = borders([*rows[0], *rows[1]])
     x = make(2, 75, 6, 4) | {"initial_state": torch.randn(5, 6, 4)}
-    flat = {
-        k: v.reshape(1, 150, *v.shape[2:]) if v.shape[:2] == (2, 75) else v for k, v in x.items()
-    }
-    out, last = scan(**x, seq_idx=seq_idx)
-    want, want_last = scan(**flat, cu_seqlens=borders([*rows[0], *rows[1]]))
-    assert torch.equal(out.flatten(0, 1), want[0]) and torch.equal(last, want_last)
-    x = conv_inputs(2, 75, 6, 4)
-    x = {k: x[k] for k in ("x", "weight", "bias")}
-    out = causal_conv1d(**x, seq_idx=seq_idx)
-    flat = x | {"x": x["x"].reshape(1, 150, 6)}
-    want = causal_conv1d(**flat, cu_seqlens=borders([*rows[0], *rows[1]]))
-    assert torch.equal(out.flatten(0, 1), want[0])
+    y = {k: v for k, v in unpacked(2, 75, 6, 4).items() if k != "initial_state"}
+    for function, inputs in ((scan, x), (lambda **x: [causal_conv1d(**x)], y)):
+        flat = {k: v.flatten(0, 1)[None] if len(v) == 2 else v for k, v in inputs.items()}
+        outs = function(**inputs, seq_idx=seq_idx.int())
+        wants = function(**flat, cu_seqlens=cuts)
+        assert torch.equal(outs[0].flatten(0, 1), wants[0][0])
+        assert all(map(torch.equal, outs[1:], wants[1:]))
 
 
 def test_padding_of_causal_conv1d():
     """Numbers below 0 are no sequence for causal-conv1d: output 0, and no gradient flows."""
-    x = conv_inputs(1, 9, 3, 4)
+    x = unpacked(1, 9, 3, 4)
     t = x["x"].transpose(1, 2).detach().requires_grad_()
     seq_idx = torch.tensor([[0, 0, 0, 1, 1, 1, -1, -1, -1]])
     out = causal_conv1d_fn(t, x["weight"], x["bias"], seq_idx=seq_idx)
@@ -199,57 +191,41 @@ def test_padding_of_causal_conv1d():
         ({"cu_seqlens": [0, 4, 3, 7]}, ValueError, "decreases from 4 to 3"),
         ({"cu_seqlens": [1, 7]}, ValueError, "goes from 1 to 7, must go from 0 to 7"),
         ({"cu_seqlens": [0, 6]}, ValueError, "goes from 0 to 6"),
-        ({"cu_seqlens": []}, ValueError, r"shape \[S \+ 1\] .*got \(0,\)"),
+        ({"cu_seqlens": torch.empty(0).int()}, ValueError, r"shape \[S \+ 1\] .*got \(0,\)"),
         ({"cu_seqlens": [0.0, 7.0]}, TypeError, "must have dtype torch.int32.*got torch.float32"),
         ({"cu_seqlens": "all"}, TypeError, "cu_seqlens must be a tensor, got str"),
         ({"cu_seqlens": torch.tensor([0, 7]).to_sparse()}, TypeError, "cu_seqlens must be dense"),
         ({"seq_idx": torch.zeros(1, 7).int().to_sparse()}, TypeError, "seq_idx must be dense"),
         ({"seq_idx": [[0, 0, 1, 1, 0, 2, 2]]}, ValueError, "row 0 repeats 0"),
         ({"seq_idx": [[0, 1]]}, ValueError, r"shape \(1, 7\), got \(1, 2\)"),
-        (
-            {"seq_idx": [[0] * 7], "cu_seqlens": [0, 7]},
-            ValueError,
-            "pass either cu_seqlens or seq_idx",
-        ),
+        ({"seq_idx": [[0] * 7], "cu_seqlens": [0, 7]}, ValueError, "pass either cu_seqlens or"),
     ],
 )
 def test_bad_sequences(given, error, text):
     given = {k: torch.tensor(v) if isinstance(v, list) else v for k, v in given.items()}
-    if "falls" in text or "goes" in text:
-        given["cu_seqlens"] = given["cu_seqlens"].int()
-    if text.startswith("shape"):
-        given = {k: v.int() for k, v in given.items()}
-    with pytest.raises(error, match=text):
-        selective_scan(**make(1, 7, 5, 3), **given)
-    with pytest.raises(error, match=text):
-        causal_conv1d(**conv_inputs(1, 7, 5, 4), **given)
+    for function, inputs in ((selective_scan, make(1, 7, 5, 3)), (conv, unpacked(1, 7, 5, 4))):
+        with pytest.raises(error, match=text):
+            function(**inputs, **given)
 
 
 def test_bad_states_and_devices():
-    cuts = torch.tensor([0, 3, 7])
-    with pytest.raises(
-        ValueError, match=r"initial_state must have shape \(2, 5, 3\).*, got \(1, 5, 3\)"
+    right, x = torch.tensor([0, 3, 7]), make(1, 7, 5, 3)
+    for function, given, cuts, text in (
+        (scan, x, right, r"initial_state must have shape \(2, 5, 3\).*, got \(1, 5, 3\)"),
+        (conv, unpacked(1, 7, 5, 4), right, r"initial_state must have .*\(2, 3, 5\).*\(1, 3, 5\)"),
+        (scan, x, right.to("meta"), "cu_seqlens must be on cpu, as the tokens, got meta"),
+        (scan, make(2, 7, 5, 3), right, r"got \(3,\) with 2"),
     ):
-        selective_scan(
-            **make(1, 7, 5, 3) | {"initial_state": torch.zeros(1, 5, 3)}, cu_seqlens=cuts
-        )
-    with pytest.raises(
-        ValueError, match=r"initial_state must have shape \(2, 3, 5\).*, got \(1, 3, 5\)"
-    ):
-        causal_conv1d(**conv_inputs(1, 7, 5, 4), cu_seqlens=cuts)
-    with pytest.raises(ValueError, match="cu_seqlens must be on cpu, as the tokens, got meta"):
-        selective_scan(**make(1, 7, 5, 3), cu_seqlens=cuts.to("meta"))
-    with pytest.raises(ValueError, match="got \(3,\) with 2"):
-        selective_scan(**make(2, 7, 5, 3), cu_seqlens=cuts)
+        with pytest.raises(ValueError, match=text):
+            function(**given, cu_seqlens=cuts)
 
 
 def test_operator_contracts_and_whole_graph():
     """Schema, fake tensors, autograd registration; one graph of both operators under compile."""
     rows = sequences(torch.empty(1, 7, 1), torch.tensor([0, 3, 7]), None)
-    x = leaves(scan_inputs([3, 4], 5, 3))
+    x, y = leaves(scan_inputs([3, 4], 5, 3)), leaves(conv_inputs([3, 4], 5, 4))
     arguments = (*x.values(), rows, True, "mamba", True)
     torch.library.opcheck(torch.ops.gamba_warp.selective_scan.default, arguments)
-    y = leaves(conv_inputs(1, 7, 5, 4) | {"initial_state": torch.randn(2, 3, 5)})
     arguments = (*y.values(), rows, True)
     torch.library.opcheck(torch.ops.gamba_warp.causal_conv1d.default, arguments)
 
@@ -264,8 +240,7 @@ def test_operator_contracts_and_whole_graph():
 
 def test_export_and_autocast_keep_the_bits(tmp_path):
     """A program of both operators, written to a file and read, with borders it was not made for."""
-    x = scan_inputs([3, 4], 5, 3)
-    y = conv_inputs(1, 7, 5, 4) | {"initial_state": torch.randn(2, 3, 5)}
+    x, y = scan_inputs([3, 4], 5, 3), conv_inputs([3, 4], 5, 4)
 
     class Both(torch.nn.Module):
         def forward(self, cu_seqlens):
