@@ -5,12 +5,8 @@ import torch
 import torch.nn.functional as F
 from helpers import assert_rel_rms
 
-from gamba_warp.compat.causal_conv1d import (
-    causal_conv1d_fn,
-    causal_conv1d_ref,
-    causal_conv1d_update,
-    causal_conv1d_update_ref,
-)
+from gamba_warp.compat import causal_conv1d as compat
+from gamba_warp.compat.causal_conv1d import causal_conv1d_ref, causal_conv1d_update
 from gamba_warp.compat.causal_conv1d.causal_conv1d_varlen import causal_conv1d_varlen_states
 
 LIMITS = {torch.float32: 5e-7, torch.float16: 5e-4, torch.bfloat16: 4e-3}  # half an ulp
@@ -28,7 +24,7 @@ def whole(tokens, weight, bias, activation):
 @pytest.mark.parametrize("ring", [False, True])
 @pytest.mark.parametrize("width, size", [(2, 1), (3, 3), (4, 4), (4, 3), (3, 9)])
 @pytest.mark.parametrize("bias, activation", [(True, "silu"), (False, None)])
-@pytest.mark.parametrize("update", [causal_conv1d_update, causal_conv1d_update_ref])
+@pytest.mark.parametrize("update", [causal_conv1d_update, compat.causal_conv1d_update_ref])
 def test_pieces_make_the_whole(width, size, ring, bias, activation, dtype, update):
     batch, channels, pieces = 3, 5, (1, 1, 4, 2, 1, 11, 1)
     tokens = torch.randn(batch, channels, sum(pieces)).to(dtype)
@@ -53,17 +49,14 @@ def test_the_reference(states, activation):
     """float64, any number of taps, and gradients."""
     x, weight = torch.randn(2, 3, 11).double().requires_grad_(), torch.randn(3, 6).double()
     bias, first = torch.randn(3).double(), torch.randn(2, 3, 5).double()
-    before = first if states else torch.zeros_like(first)
-    out, final = causal_conv1d_ref(
-        x, weight, bias, first if states else None, True, activation=activation
-    )
+    before, given = (first, first) if states else (torch.zeros_like(first), None)
+    out, final = causal_conv1d_ref(x, weight, bias, given, True, activation=activation)
     padded = torch.cat([before, x], -1)
     want = whole(padded, weight, bias, activation)[..., 5:]
     assert torch.allclose(out, want, atol=1e-12) and torch.equal(final, padded[..., -5:])
-    given = torch.empty_like(first)
-    assert (
-        causal_conv1d_ref(x, weight, return_final_states=True, final_states_out=given)[1] is given
-    )
+    into = torch.empty_like(first)
+    given = {"return_final_states": True, "final_states_out": into}
+    assert causal_conv1d_ref(x, weight, **given)[1] is into
     grads = [torch.autograd.grad(y.sum(), x, retain_graph=True)[0] for y in (out, want)]
     assert torch.allclose(*grads, atol=1e-12)
     for wrong in ({"activation": "relu"}, {"seq_idx": torch.zeros(2, 11)}):
@@ -110,9 +103,8 @@ def test_rows_by_indices_and_padding(ring):
     at = torch.tensor([3, 8, 1], dtype=torch.int32) if ring else None
     expected = state.clone()
     rows = expected[[4, 2]]
-    want = causal_conv1d_update(
-        x[[0, 2]], rows, weight, bias, "silu", at if at is None else at[::2]
-    )
+    places = at if at is None else at[::2]
+    want = causal_conv1d_update(x[[0, 2]], rows, weight, bias, "silu", places)
     expected[[4, 2]] = rows
     indices = torch.tensor([4, -1, 2], dtype=torch.int32)
     out = causal_conv1d_update(x, state, weight, bias, "silu", at, indices)
@@ -123,7 +115,7 @@ def test_rows_by_indices_and_padding(ring):
 def test_the_form_of_version_1_0():
     """The activation comes after the bias."""
     x, weight, bias = torch.randn(2, 5, 9), torch.randn(5, 4), torch.randn(5)
-    want = causal_conv1d_fn(x, weight, bias, activation="silu")
-    assert torch.equal(causal_conv1d_fn(x, weight, bias, "silu"), want)
+    want = compat.causal_conv1d_fn(x, weight, bias, activation="silu")
+    assert torch.equal(compat.causal_conv1d_fn(x, weight, bias, "silu"), want)
     with pytest.raises(ValueError, match="activation"):
-        causal_conv1d_fn(x, weight, bias, "relu")
+        compat.causal_conv1d_fn(x, weight, bias, "relu")

@@ -8,24 +8,11 @@ import pytest
 import torch
 from helpers import assert_rel_rms
 from helpers import first_splatting as first
-from helpers.first_splatting import (
-    CASES,
-    compare,
-    draw,
-    draw_first,
-    moved_by,
-    scene_of,
-    settings_of,
-    with_covariances,
-)
+from helpers.first_splatting import CASES, draw, draw_first, scene_of, settings_of
 from helpers.forked import python
 
 from gamba_warp.compat import diff_gaussian_rasterization as drop_in
-from gamba_warp.compat.diff_gaussian_rasterization import (
-    GaussianRasterizationSettings,
-    GaussianRasterizer,
-    rasterize_gaussians,
-)
+from gamba_warp.compat.diff_gaussian_rasterization import GaussianRasterizer
 from gamba_warp.compat.simple_knn._C import distCUDA2
 
 pytestmark = pytest.mark.usefixtures("one_thread")
@@ -42,7 +29,7 @@ def fork():
 @pytest.mark.parametrize("seed", [0, 1])
 def test_images_and_gradients(name, seed):
     torch.manual_seed(seed)
-    compare(name)
+    first.compare(name)
 
 
 @pytest.mark.parametrize("name", ["ingra14m", "ashawkey"])
@@ -79,7 +66,7 @@ def test_gradients_of_the_pose(fork, degree):
     scene["opacities"] *= 0.98
     rho, theta, twist = (torch.zeros(n, requires_grad=True) for n in (3, 3, 6))
     color, _, depth, alpha, _ = draw({**scene, "rho": rho, "theta": theta}, settings)
-    want, _ = draw_first(scene, moved_by(settings, twist.double()))
+    want, _ = draw_first(scene, first.moved_by(settings, twist.double()))
     clear = ~want["close"]
     v, v_depth = (torch.randn(n, first.HEIGHT, first.WIDTH) * clear for n in (3, 1))
     torch.autograd.backward([color, depth], [v, v_depth])
@@ -91,7 +78,8 @@ def test_gradients_of_the_pose(fork, degree):
     got = torch.cat([rho.grad, theta.grad])
     assert_rel_rms(got, twist.grad, first.GRADIENT, "pose")
     steps = 1e-6 * torch.eye(6, dtype=torch.float64)
-    ends = [[loss(draw_first(scene, moved_by(settings, s * x))[0]) for s in (1, -1)] for x in steps]
+    moved = [[first.moved_by(settings, s * x) for s in (1, -1)] for x in steps]
+    ends = [[loss(draw_first(scene, x)[0]) for x in pair] for pair in moved]
     slopes = torch.stack([(after - before) / 2e-6 for after, before in ends])
     assert_rel_rms(got, slopes, first.GRADIENT, "differences")
     assert not alpha.requires_grad
@@ -129,7 +117,7 @@ def test_absolute_gradients_for_densification(fork):
 def test_radii_alone(covars):
     settings, scene = settings_of(scale_modifier=1.7), scene_of()
     if covars:
-        scene = with_covariances(scene, 1.0)
+        scene = first.with_covariances(scene, 1.0)
     names = {"means3D", "scales", "rotations", "cov3D_precomp"} & {*scene}
     radii = GaussianRasterizer(settings).visible_filter(**{name: scene[name] for name in names})
     assert torch.equal(radii, draw(scene, settings)[1]) and radii.dtype == torch.int32
@@ -190,7 +178,7 @@ def test_the_function_takes_empty_tensors():
     settings, scene = settings_of(), scene_of(40)
     x, empty = scene, torch.Tensor([])
     given = x["means3D"], x["means2D"], empty, x["colors"], x["opacities"], x["scales"]
-    got = rasterize_gaussians(*given, x["rotations"], empty, settings)
+    got = drop_in.rasterize_gaussians(*given, x["rotations"], empty, settings)
     assert torch.equal(got[0], draw(scene, settings)[0])
 
 
@@ -240,7 +228,7 @@ def test_options_of_other_rasterizers_are_refused():
     given = settings_of()._asdict()
     for name in ("kernel_size", "subpixel_offset"):
         with pytest.raises(TypeError, match=f"{name} is an option of another rasterizer"):
-            GaussianRasterizationSettings(**given, **{name: 0.1})
+            drop_in.GaussianRasterizationSettings(**given, **{name: 0.1})
     for name in ("sh_objs", "features"):  # Gaussian grouping, feature splatting
         with pytest.raises(TypeError, match=f"^{name} is an argument of another rasterizer and is"):
             draw({**scene_of(9), name: torch.zeros(9, 16)}, settings_of())

@@ -5,28 +5,14 @@ import subprocess
 import pytest
 import torch
 import torch.nn.functional as F
-from helpers import assert_rel_rms
+from helpers import assert_all_rel_rms, assert_rel_rms, mamba
 from helpers.forked import python
-from helpers.mamba import (
-    BATCH,
-    CHANNELS,
-    GROUPED,
-    LENGTH,
-    STATES,
-    block_in_float64,
-    block_inputs,
-    run,
-    scan_in_float64,
-    scan_inputs,
-)
+from helpers.mamba import BATCH, CHANNELS, LENGTH
 
 from gamba_warp.compat.causal_conv1d import cpp_functions
 from gamba_warp.compat.extensions import EXTENSIONS, extension
-from gamba_warp.compat.mamba_ssm.ops.selective_scan_interface import (
-    bimamba_inner_fn,
-    bimamba_inner_ref,
-    mamba_inner_fn_no_out_proj,
-)
+from gamba_warp.compat.mamba_ssm.ops import selective_scan_interface as interface
+from gamba_warp.compat.mamba_ssm.ops.selective_scan_interface import bimamba_inner_fn
 
 NAMES = ("u", "delta", "A", "B", "C", "D", "z", "delta_bias")
 scan, conv = extension("selective_scan_cuda"), extension("causal_conv1d_cuda")
@@ -34,14 +20,14 @@ scan, conv = extension("selective_scan_cuda"), extension("causal_conv1d_cuda")
 
 def given(without=(), dtype=torch.float32):
     """Return all tensors of the scan in the order of its arguments, None for those left out."""
-    return dict.fromkeys(NAMES) | scan_inputs(GROUPED, GROUPED, dtype, without)
+    return dict.fromkeys(NAMES) | mamba.scan_inputs(mamba.GROUPED, mamba.GROUPED, dtype, without)
 
 
 def in_float64(tensors, dout):
     """Output before and after the gate, the last state and the gradients by name."""
     wide = {k: v.double().requires_grad_() for k, v in tensors.items() if v is not None}
-    out, last = scan_in_float64(**wide, softplus=True)
-    ungated = scan_in_float64(**{k: v for k, v in wide.items() if k != "z"}, softplus=True)[0]
+    out, last = mamba.scan_in_float64(**wide, softplus=True)
+    ungated = mamba.scan_in_float64(**{k: v for k, v in wide.items() if k != "z"}, softplus=True)[0]
     grads = torch.autograd.grad(out, list(wide.values()), dout.double())
     return ungated, out, last, dict(zip(wide, grads))
 
@@ -141,13 +127,10 @@ def test_the_convolution_of_every_version(silu):
 def test_packed_sequences_reach_the_convolution():
     x, weight = torch.randn(1, CHANNELS, LENGTH), torch.randn(CHANNELS, 3)
     seq_idx = (torch.arange(LENGTH) >= 5).int()[None]
-    halves = [
-        conv.causal_conv1d_fwd(part, weight, None, True) for part in x.split([5, LENGTH - 5], -1)
-    ]
+    parts = x.split([5, LENGTH - 5], -1)
+    want = torch.cat([conv.causal_conv1d_fwd(part, weight, None, True) for part in parts], -1)
     for rest in ((seq_idx,), (seq_idx, None, None)):
-        assert torch.equal(
-            conv.causal_conv1d_fwd(x, weight, None, *rest, True), torch.cat(halves, -1)
-        )
+        assert torch.equal(conv.causal_conv1d_fwd(x, weight, None, *rest, True), want)
 
 
 def test_the_update_of_every_version():
@@ -161,31 +144,28 @@ def test_the_update_of_every_version():
         got = conv.causal_conv1d_update(x, given, weight, bias, *rest)
         assert torch.allclose(got, want, atol=1e-6) and torch.equal(given, padded)
     assert torch.allclose(out, want, atol=1e-6)
-    assert (
-        cpp_functions.causal_conv1d_update_function
-        is EXTENSIONS["causal_conv1d_cuda"]["causal_conv1d_update"]
-    )
+    update = EXTENSIONS["causal_conv1d_cuda"]["causal_conv1d_update"]
+    assert cpp_functions.causal_conv1d_update_function is update
 
 
 @pytest.mark.parametrize("constant", [False, True])
 def test_the_blocks_of_the_forks(constant):
     """Without the last projection, and in both directions."""
-    tensors = {k: v for k, v in block_inputs(constant, constant).items() if v is not None}
+    tensors = {k: v for k, v in mamba.block_inputs(constant, constant).items() if v is not None}
     ends = {name: tensors.pop(name) for name in ("out_proj_weight", "out_proj_bias")}
     if not constant:
         del tensors["B_proj_bias"], tensors["C_proj_bias"]
-    ends["A_b"] = -torch.rand(CHANNELS, STATES)
-    for function, more in ((mamba_inner_fn_no_out_proj, {}), (bimamba_inner_fn, ends)):
-        got = run(function, tensors | more)
-        for name, value in run(block_in_float64, tensors | more, torch.float64).items():
-            # Float32 through several products: the largest gradients add some hundred terms.
-            assert_rel_rms(got[name], value, 2e-6 if name == "out" else 5e-6, name)
+    ends["A_b"] = -torch.rand(CHANNELS, mamba.STATES)
+    for function, more in ((interface.mamba_inner_fn_no_out_proj, {}), (bimamba_inner_fn, ends)):
+        got = mamba.run(function, tensors | more)
+        want = mamba.run(mamba.block_in_float64, tensors | more, torch.float64)
+        # Float32 through several products: the largest gradients add some hundred terms.
+        assert_all_rel_rms(got, want, 5e-6, out=2e-6)
     if not constant:
         order = [*list(tensors)[:5], "out_proj_weight", "out_proj_bias", "A", "A_b"]
         given = tensors | ends
-        by_place = bimamba_inner_ref(
-            *(given[k] for k in order), None, None, given["D"], given["delta_bias"]
-        )
+        places = *(given[k] for k in order), None, None, given["D"], given["delta_bias"]
+        by_place = interface.bimamba_inner_ref(*places)
         assert torch.equal(by_place, bimamba_inner_fn(**given))
 
 

@@ -8,13 +8,8 @@ import torch
 from helpers import assert_rel_rms
 from helpers.raster import leaves, make, mapped
 
-from gamba_warp.compat.gsplat import (
-    RollingShutterType,
-    SelectiveAdam,
-    quat_scale_to_covar_preci,
-    rasterization,
-    rasterize_to_pixels,
-)
+from gamba_warp.compat import gsplat
+from gamba_warp.compat.gsplat import rasterization, rasterize_to_pixels
 from gamba_warp.compat.gsplat.rendering import MUST_BE_DEFAULT
 from gamba_warp.kernels import rasterization as ours
 
@@ -103,7 +98,7 @@ def test_covariances(kind, eps2d):
     scene["means"][:, 5] = float("nan")
     scene["scales"][:, 6] = 0  # a point, which has no footprint without eps2d
     got, want = asking(scene), asking(scene)
-    covars = quat_scale_to_covar_preci(got["quats"], got["scales"], True, False)[0]
+    covars = gsplat.quat_scale_to_covar_preci(got["quats"], got["scales"], True, False)[0]
     given = {**got, "quats": None, "scales": None, "covars": covars}
     options = dict(rasterize_mode=kind, packed=False, eps2d=eps2d)
     renders, _, meta = rasterization(**given, **options)
@@ -188,7 +183,7 @@ def test_simple_trainer(packed):
     params = {name: torch.nn.Parameter(scene[name].clone()) for name in ("means", "colors")}
     lr, eps, betas = 0.01, 1e-8, (0.9, 0.999)
     optimizers = [
-        SelectiveAdam([{"params": x, "lr": lr, "name": name}], eps=eps, betas=betas)
+        gsplat.SelectiveAdam([{"params": x, "lr": lr, "name": name}], eps=eps, betas=betas)
         for name, x in params.items()
     ]
     want = {name: (x.detach().double(), 0.0, 0.0) for name, x in params.items()}
@@ -265,7 +260,7 @@ def test_sizes_are_integers():
 DEFAULTS = {k: p.default for k, p in inspect.signature(rasterization).parameters.items()}
 OTHER = {None: torch.zeros(2, 3, 6), False: True, True: False, "pinhole": "fisheye"}
 OPTIONS = {name: OTHER[DEFAULTS[name]] for name in MUST_BE_DEFAULT} | dict(
-    rolling_shutter=RollingShutterType.ROLLING_TOP_TO_BOTTOM, render_mode="d",
+    rolling_shutter=gsplat.RollingShutterType.ROLLING_TOP_TO_BOTTOM, render_mode="d",
     rasterize_mode="fast", sh_degree=5, near_plane=0.0, width=0, opacities=torch.zeros(2, 36),
     backgrounds=torch.zeros(2, 3, 4), Ks=torch.zeros(2, 2, 3, 3),
 )  # fmt: skip

@@ -7,6 +7,7 @@ import pytest
 import torch
 from helpers import assert_rel_rms
 from helpers.mamba import layer_in_float64
+from helpers.scan import assert_gradients, leaves
 from torch import nn
 
 from gamba_warp.compat.mamba_ssm.models.mixer_seq_simple import _init_weights, create_block
@@ -60,16 +61,11 @@ def test_blocks_equal_float64(rms, fused):
     with torch.no_grad():
         for parameter in model.parameters():
             parameter += 0.05 * torch.randn_like(parameter)
-    x = torch.randn(2, 7, WIDTH)
-    wide = {k: v.detach().double().requires_grad_() for k, v in model.named_parameters()}
-    want = stack_in_float64(wide, x, rms)
-    out = model(x)
+    x, mine = torch.randn(2, 7, WIDTH), dict(model.named_parameters())
+    wide = leaves(mine, torch.float64)
+    out, want = model(x), stack_in_float64(wide, x, rms)
     assert_rel_rms(out, want, 2e-6, "out")  # two layers in float32
-    cotangent = torch.randn_like(out)
-    got = torch.autograd.grad(out, list(model.parameters()), cotangent)
-    want = torch.autograd.grad(want, list(wide.values()), cotangent.double())
-    for name, a, b in zip(wide, got, want, strict=True):
-        assert_rel_rms(a, b, 1e-5, name)
+    assert_gradients((mine, [out]), (wide, [want]), 1e-5)
 
 
 def test_the_weights_have_the_public_names():
@@ -157,9 +153,8 @@ def inputs(names, dtype):
 @pytest.mark.parametrize("function", ["layer_norm_fn", "rms_norm_fn", "rms_norm_ref"])
 def test_the_norms_are_those_of_float64(function, names, dtype):
     tensors = inputs(names, dtype)
-    leaves = {k: v.clone().requires_grad_() for k, v in tensors.items()}
-    found = getattr(norms, function)(**{"bias": None, **leaves}, eps=1e-3, prenorm=True)
-    wide = {k: v.double().requires_grad_() for k, v in tensors.items()}
+    mine, wide = leaves(tensors), leaves(tensors, torch.float64)
+    found = getattr(norms, function)(**{"bias": None, **mine}, eps=1e-3, prenorm=True)
     named = {k: v for k, v in wide.items() if k != "rowscale"}
     if "rowscale" in wide:
         named["rows"] = wide["rowscale"][..., None]
@@ -167,13 +162,10 @@ def test_the_norms_are_those_of_float64(function, names, dtype):
     assert len(found) == len(wanted)
     kept = dtype if "residual" not in names else torch.float32
     assert [y.dtype for y in found] == [dtype] * (len(found) - 1) + [kept]
-    cotangents = [torch.randn(SHAPE).to(y.dtype) for y in found]
     for place, (got, want) in enumerate(zip(found, wanted)):
         assert_rel_rms(got, want, LIMITS[dtype], f"output {place}")
-    grads = torch.autograd.grad(found, list(leaves.values()), cotangents)
-    want = torch.autograd.grad(wanted, list(wide.values()), [c.double() for c in cotangents])
-    for name, got, value in zip(leaves, grads, want):
-        assert_rel_rms(got, value, 2 * LIMITS[dtype], name)  # sums of rounded products
+    limit = 2 * LIMITS[dtype]  # sums of rounded products
+    assert_gradients((mine, found), (wide, wanted), limit, limit)
     alone = getattr(norms, function)(**{"bias": None, **tensors}, eps=1e-3)
     firsts = alone if isinstance(alone, tuple) else (alone,)
     assert len(firsts) == len(found) - 1 and all(map(torch.equal, firsts, found))

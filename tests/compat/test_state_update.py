@@ -6,10 +6,8 @@ import pytest
 import torch
 from helpers import assert_rel_rms
 
-from gamba_warp.compat.mamba_ssm.ops.triton.selective_state_update import (
-    selective_state_update,
-    selective_state_update_ref,
-)
+from gamba_warp.compat.mamba_ssm.ops.triton import selective_state_update as updates
+from gamba_warp.compat.mamba_ssm.ops.triton.selective_state_update import selective_state_update
 
 # Half an ulp of what is stored; float32 has a few roundings of its own.
 LIMITS = {torch.float32: 1e-6, torch.float16: 5e-4, torch.bfloat16: 4e-3}
@@ -50,7 +48,7 @@ def compare(state, given, indices=None, softplus=True):
     dtype, rows = state.dtype, slice(None) if indices is None else indices.long()
     wide, doubles = state[rows].double(), {name: x.double() for name, x in given.items()}
     want, after = in_float64(wide, doubles, softplus)
-    got = selective_state_update_ref(wide, **doubles, dt_softplus=softplus)
+    got = updates.selective_state_update_ref(wide, **doubles, dt_softplus=softplus)
     assert torch.allclose(got, want, rtol=1e-11) and torch.allclose(wide, after, rtol=1e-11)
     got = selective_state_update(state, **given, dt_softplus=softplus, state_batch_indices=indices)
     assert got.dtype == given["x"].dtype and state.dtype == dtype

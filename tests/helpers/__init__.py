@@ -41,6 +41,12 @@ def assert_rel_rms(got, want, limit: float, name: str) -> None:
     assert error <= limit, f"{name}: relative rms error {error:.3g} > {limit:.3g}"
 
 
+def assert_all_rel_rms(got, want, limit: float, **limits: float) -> None:
+    """Compare all results by name; ``limits`` are those of some names."""
+    for name, value in want.items():
+        assert_rel_rms(got[name], value, limits.get(name, limit), name)
+
+
 def in_default_float64(function):
     """Return the result of a function with torch's default dtype float64."""
     before = torch.get_default_dtype()
