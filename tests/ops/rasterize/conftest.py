@@ -1,12 +1,9 @@
-"""Fixtures of the rasterizer's tests: those of others, and its CUDA path, executed from PTX."""
+"""A fixture of the rasterizer's tests: its CUDA path, executed from PTX."""
 
 import pytest
-from ops.rasterize.accuracy import cuts
 
 from gamba_warp.kernels.rasterize.cuda import capacity
 from gamba_warp.kernels.rasterize.cuda import composite as composite_cuda
-
-__all__ = ["cuts", "on_cuda"]
 
 
 @pytest.fixture

@@ -7,8 +7,7 @@ and each must lie within rounding of a cut.
 
 import pytest
 import torch
-from helpers.raster import NAMES, make, mapped
-from ops.rasterize.accuracy import BAND, assert_gradients, both
+from helpers.raster import BAND, NAMES, assert_gradients, both, make, mapped
 
 from gamba_warp.kernels.rasterize import rasterization, reference
 from gamba_warp.kernels.rasterize.constants import ALPHA_MIN
@@ -53,16 +52,16 @@ SCENES = {
 
 
 @pytest.mark.parametrize("name", SCENES)
-def test_realistic_size(cuts, name):
+def test_realistic_size(name):
     build, options = SCENES[name]
-    got, want, flipped, meta = both(build(), cuts, **options)
-    assert flipped.float().mean() <= FLIPS, f"{flipped.sum()} pixels flipped"
-    assert (cuts.distances(flipped[..., None]) < BAND).float().mean() < 0.02, "the band is too wide"
-    assert meta["pairs"] > 5000
-    assert_gradients(got, want, flipped)
+    found = both(build(), **options)
+    assert found.flipped.float().mean() <= FLIPS, f"{found.flipped.sum()} pixels flipped"
+    assert (found.distance < BAND).float().mean() < 0.02, "the band is too wide"
+    assert found.meta["pairs"] > 5000
+    assert_gradients(found)
 
 
-def test_flips_only_at_alpha_min(cuts):
+def test_flips_only_at_alpha_min():
     """Each Gaussian is made to have alpha_min at one pixel to the last bit: about half flip."""
     num = 600
     scene = ordinary(num)
@@ -80,20 +79,20 @@ def test_flips_only_at_alpha_min(cuts):
     chosen = (opacity < 0.95) & ((pixel > 0) & (pixel < torch.tensor([96, 80]))).all(1)
     assert chosen.sum() > num / 2
     scene["opacities"] = torch.where(chosen, opacity, 0.5).float()[None]
-    _, _, flipped, _ = both(scene, cuts)
+    flipped = both(scene).flipped
     assert 0.1 * chosen.sum() < flipped[0, 0].sum() < chosen.sum()
     assert flipped[0, 1].sum() <= 2, "the other view has nothing at its cuts"
 
 
-def test_flips_only_at_the_stop(cuts):
+def test_flips_only_at_the_stop():
     """Four layers of 0.9 leave 1e-4, to rounding, at every pixel: some stop before the last one."""
     scene = ordinary(4, size=1.0)
     scene["means"] = 0.01 * torch.randn(1, 4, 3)
     scene["scales"] = torch.full((1, 4, 3), 100.0)
     scene["opacities"] = torch.full((1, 4), 0.900005)
     scene["colors"] = torch.rand(1, 4, 3)
-    (_, _, alphas), (_, _, alpha), flipped, _ = both(scene, cuts)
-    assert flipped.any() and (alphas - alpha).abs().max() < 1e-3
+    found = both(scene)
+    assert found.flipped.any() and (found.got[2] - found.want[2]).abs().max() < 1e-3
 
 
 @pytest.mark.parametrize("antialiased", [False, True])
