@@ -3,7 +3,7 @@
 import os
 import subprocess
 import time
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from helpers.forked import python
 
@@ -56,13 +56,8 @@ def gamba(*words: object, kill_after: float = LONGEST, file_limit: int = -1) -> 
     """
     command = [python(*_LOADED), "-c", _CODE, str(file_limit), *map(str, words)]
     started, killed = time.monotonic(), False
-    process = subprocess.Popen(
-        command,
-        env=os.environ | {"OMP_NUM_THREADS": "1"},
-        stdout=subprocess.PIPE,
-        stderr=subprocess.STDOUT,
-        text=True,
-    )
+    pipes: dict[str, Any] = {"stdout": subprocess.PIPE, "stderr": subprocess.STDOUT, "text": True}
+    process = subprocess.Popen(command, env=os.environ | {"OMP_NUM_THREADS": "1"}, **pipes)
     try:
         said, _ = process.communicate(timeout=kill_after)
     except subprocess.TimeoutExpired:

@@ -8,12 +8,13 @@ from typing import NamedTuple
 import numpy as np
 import trimesh
 from ablation.fake import write_plan
+from helpers.images import cut_out
+from helpers.nodes.processes import words
 from helpers.released import make_released
 from helpers.views import cloud_of
 
 from gamba_warp.files import remove_folder, write_json
 from gamba_warp.formats.ply import save_ply
-from gamba_warp.images import save_image
 
 from .child import gamba
 
@@ -44,7 +45,6 @@ def without_one_object(out: Path) -> None:
 
 
 SMALL = "--size 16 --frames 2 --device cpu"
-MODEL = "image_size=16 patch_size=4 width=16 depth=1 state_size=4 scale_init=0.06"
 JOBS = {
     "reconstruct": Job(
         "reconstruct {world}/images --out {out} --checkpoint {world}/run/model.safetensors "
@@ -90,12 +90,8 @@ JOBS = {
 
 def training(world: Path, out: Path, steps: int) -> list[str]:
     """Command that trains a tiny model, or resumes the training."""
-    line = (
-        f"train {{world}}/data --preset tiny --set {MODEL} --size 16 --lpips off "
-        "--views-per-object 2 --val-every 10 --device cpu --workers 1 --batch-size 2 "
-        f"--save-every 3 --log-every 1 --out {{out}} --steps {steps}"
-    )
-    return Job(line).words(world, out)
+    more = ("--views-per-object", 2, "--val-every", 10, "--workers", 1, "--save-every", 3)
+    return ["train", *words(world / "data", out, *more, "--steps", steps)]
 
 
 def undisturbed(*words: object):
@@ -118,10 +114,8 @@ def make_world(folder: Path, commands: list[str]) -> None:
     parts = {"version": 1, "train": ["ball", "box"], "val": ["cone"], "test": []}
     write_json(folder / "data" / "split.json", parts)
     undisturbed(*training(folder, folder / "run", 2))
-    rgba = np.zeros((20, 30, 4))
-    rgba[4:16, 8:24] = (0.8, 0.3, 0.1, 1)
     for name in ("a", "b"):
-        save_image(folder / "images" / f"{name}.png", rgba)
+        cut_out(folder / "images" / f"{name}.png")
     points = rng.normal(size=(200, 3))
     points *= 0.4 / np.linalg.norm(points, axis=1, keepdims=True)
     save_ply(folder / "gaussians" / "ball.ply", cloud_of(points, 0.08, 0.95, rng.random((200, 3))))

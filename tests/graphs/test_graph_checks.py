@@ -3,6 +3,7 @@
 import pytest
 import torch
 from gpu import checks
+from torch.utils._pytree import tree_map
 
 CPU = torch.device("cpu")
 
@@ -17,11 +18,7 @@ class Graph:
         made = self.run()
         if self.spoil is not None:
             self.spoil(made)
-        pairs = [(self.made, made)]
-        if isinstance(made, dict):
-            pairs = [(self.made[name], value) for name, value in made.items()]
-        for old, new in pairs:
-            old.copy_(new)
+        tree_map(torch.Tensor.copy_, self.made, made)
 
 
 @pytest.fixture

@@ -2,7 +2,7 @@
 
 import gc
 import weakref
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -51,31 +51,24 @@ def trained(data, out, kind, most):
     setup = Setup(config, open_data(config), micro.ALONE)
     torch.manual_seed(1)
     state = RunState.begin(Gamba(config.model_config()).train(), setup)
-    kept = RecordedGraphs(
-        lambda: [
-            *state.model.parameters(),
-            *state.result.parameters(),
-            *(x for entry in state.optimizer.state.values() for x in entry.values()),
-        ],
-        most,
-    )
+
+    def changed():
+        moments = (x for entry in state.optimizer.state.values() for x in entry.values())
+        return [*state.model.parameters(), *state.result.parameters(), *moments]
+
+    kept = RecordedGraphs(changed, most)
     objective = Objective({}, lpips, config.loss.lpips_crop)
     step = make_step(state.model, state.optimizer, state.ema, objective, graphs=kept)
-    batches, outcomes = (
-        Batches(setup.data, config, micro.ALONE, lambda number: 2, STEPS),
-        Outcomes(state, micro.ALONE, NoLog()),
-    )
-    figures = []
+    batches = Batches(setup.data, config, micro.ALONE, lambda number: 2, STEPS)
+    outcomes, figures = Outcomes(state, micro.ALONE, NoLog()), []
     for number in range(STEPS):
         batch = batches.take(number)  # with images' stems, as on a GPU
         own = batch.foreground and replace(batch.foreground, boxes=[])
         targets = batch.targets + (torch.nan if number == BAD else 0)
         progress = Progress(number, number / setup.steps_per_epoch, number / STEPS)
-        outcome = step(
-            [replace(batch, foreground=own, targets=targets)],
-            term_weights(config.loss, progress),
-            config.optim.lr * state.schedule.fraction(number, 0.0),
-        )
+        rate = config.optim.lr * state.schedule.fraction(number, 0.0)
+        parts = [replace(batch, foreground=own, targets=targets)]
+        outcome = step(parts, term_weights(config.loss, progress), rate)
         result = outcome.result
         shown = result.loss, result.rgb, *result.gaussians.tensors().values()
         assert all(x.grad_fn is None for x in shown)  # a graph keeps what it returns
@@ -110,10 +103,17 @@ class Numbers:
     values: torch.Tensor
 
 
-def test_graphs_whose_lists_are_outgrown_are_captured_again(monkeypatch):
-    outgrown, made, kept = [], [], RecordedGraphs(list, most=1)
-    monkeypatch.setattr(graphs, "lists_outgrown", lambda: bool(outgrown))
-    monkeypatch.setattr(graphs, "forget_graphs", outgrown.clear)
+@pytest.fixture
+def outgrown(monkeypatch):
+    """A list; while it is not empty, the lists of the rasterizer are outgrown."""
+    found = []
+    monkeypatch.setattr(graphs, "lists_outgrown", lambda: bool(found))
+    monkeypatch.setattr(graphs, "forget_graphs", found.clear)
+    return found
+
+
+def test_graphs_whose_lists_are_outgrown_are_captured_again(outgrown):
+    made, kept = [], RecordedGraphs(list, most=1)
 
     def doubled(batch):
         made.append(2 * batch.values)
@@ -136,9 +136,8 @@ class Pools:
     def __init__(self, monkeypatch):
         self.graphs = {}
         monkeypatch.setattr(torch.cuda, "graph_pool_handle", object)
-        monkeypatch.setattr(
-            torch.cuda, "CUDAGraph", type("Graph", (), {"replay": lambda self: None})
-        )
+        graph = type("Graph", (), {"replay": lambda self: None})
+        monkeypatch.setattr(torch.cuda, "CUDAGraph", graph)
         monkeypatch.setattr(torch.cuda, "graph", self.capture)
 
     @contextmanager
@@ -150,20 +149,11 @@ class Pools:
         yield
 
 
-class Graphs(graphs.StepGraphs):
-    """Graphs by torch's own calls, without a stream."""
-
-    @contextmanager
-    def _on_stream(self):
-        yield
-
-
-def test_graphs_of_a_grown_scene_have_a_pool_of_their_own(monkeypatch):
-    outgrown, said = [], []
+def test_graphs_of_a_grown_scene_have_a_pool_of_their_own(monkeypatch, outgrown):
+    said = []
     Pools(monkeypatch)
-    monkeypatch.setattr(graphs, "lists_outgrown", lambda: bool(outgrown))
-    monkeypatch.setattr(graphs, "forget_graphs", outgrown.clear)
-    kept = Graphs(torch.device("cpu"), said.append)
+    monkeypatch.setattr(graphs.StepGraphs, "_on_stream", lambda self: nullcontext())
+    kept = graphs.StepGraphs(torch.device("cpu"), said.append)
     batch = Numbers(torch.ones(2))
     for number in range(6):
         if number == 4:
@@ -192,9 +182,8 @@ def test_a_capture_without_memory_leaves_the_others(monkeypatch):
     monkeypatch.setattr(kept, "_record", full)
     for key in "aabbaab":
         kept.run(batch, key, lambda batch: 2 * batch.values)
-    assert kept.count == 1 and kept.said == [
-        "no CUDA graph of a step: CUDA out of memory; such steps run one by one"
-    ]
+    line = "no CUDA graph of a step: CUDA out of memory; such steps run one by one"
+    assert kept.count == 1 and kept.said == [line]
 
 
 def test_a_step_that_cannot_be_captured_runs_as_before(data, tmp_path, monkeypatch):
@@ -204,9 +193,7 @@ def test_a_step_that_cannot_be_captured_runs_as_before(data, tmp_path, monkeypat
     one, _, _ = trained(data, tmp_path / "one", "bins", 0)
     monkeypatch.setattr(RecordedGraphs, "_record", refuse)
     other, kept, _ = trained(data, tmp_path / "other", "bins", 64)
-    assert kept.replays == 0
-    assert kept.said == [
-        "no CUDA graph of a step: operation not permitted; such steps run one by one"
-    ]
+    line = "no CUDA graph of a step: operation not permitted; such steps run one by one"
+    assert kept.replays == 0 and kept.said == [line]
     for name, value in one.model.state_dict().items():
         assert torch.equal(value, other.model.state_dict()[name]), name

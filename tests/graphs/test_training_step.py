@@ -91,9 +91,8 @@ def test_a_training_step_waits_for_nothing(on_paper, monkeypatch, preset, weight
         for p in parameters:
             p.grad = torch.empty_like(p)
         norm = torch.nn.utils.clip_grad_norm_(parameters, 1.0)
-        update(
-            optimizer, ema, fraction, Gradients(result.loss.detach(), norm, batch, result), model
-        )
+        found = Gradients(result.loss.detach(), norm, batch, result)
+        update(optimizer, ema, fraction, found, model)
     assert watch.found == []
     assert computed <= MOST[preset], computed
     names = [launch.kernel.func.__name__ for launch in on_paper]
