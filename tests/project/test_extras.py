@@ -144,39 +144,31 @@ def test_training_loads_without_what_makes_objects(monkeypatch):
 
 
 @pytest.mark.parametrize(
-    "arguments, library, extra",
+    "line, library, extra",
     [
-        (["train", "data"], "kornia", "train"),
-        (["data", "render", "meshes", "--out", "out"], "trimesh", "mesh"),
-        (["eval-views", "--checkpoint", "m", "--data", "d"], "kornia", "eval"),
-        (["demo"], "kornia", "all"),
-        (["app"], "gradio", "app"),
+        ("train data", "kornia", "train"),
+        ("data render meshes --out {0}/out", "trimesh", "mesh"),
+        ("eval-views --checkpoint m --data d", "kornia", "eval"),
+        ("demo", "kornia", "all"),
+        ("app", "gradio", "app"),
+        ("reconstruct {0}/thing.png --out {0}/out --mesh obj", "trimesh", "mesh"),
+        ("reconstruct {0}/thing.png --out {0}/out --turntable mp4", "imageio_ffmpeg", "video"),
+        ("export {0}/thing.ply --out {0}/out --splats spz", "trimesh", "mesh"),  # a mesh by default
+        (
+            "export {0}/thing.ply --out {0}/out --mesh none --turntable mp4",
+            "imageio_ffmpeg",
+            "video",
+        ),
+        ("render {0}/thing.ply --out {0}/out --kind mp4", "imageio_ffmpeg", "video"),
     ],
 )
-def test_what_is_missing_is_one_line(arguments, library, extra, tmp_path):
-    done = in_the_core(*arguments)
-    name = " ".join(arguments[:2]) if arguments[0] == "data" else arguments[0]
-    assert done.returncode == 2
-    what = f"{name} needs {library}, which is not installed"
-    assert done.stderr == f"gamba: {what}: {versions.to_install(extra)}\n"
-
-
-@pytest.mark.parametrize(
-    "arguments, library, extra",
-    [
-        (["reconstruct", "thing.png", "--mesh", "obj"], "trimesh", "mesh"),
-        (["reconstruct", "thing.png", "--turntable", "mp4"], "imageio_ffmpeg", "video"),
-        (["export", "thing.ply", "--splats", "spz"], "trimesh", "mesh"),  # a mesh by default
-        ("export thing.ply --mesh none --turntable mp4".split(), "imageio_ffmpeg", "video"),
-        (["render", "thing.ply", "--kind", "mp4"], "imageio_ffmpeg", "video"),
-    ],
-)
-def test_what_an_option_needs_is_said_before_any_work(arguments, library, extra, tmp_path):
+def test_what_is_missing_is_one_line_before_any_work(line, library, extra, tmp_path):
     cut_out(tmp_path / "thing.png")
     save_ply(tmp_path / "thing.ply", some(10))
-    arguments[1] = tmp_path / arguments[1]
-    done = in_the_core(*arguments, "--out", tmp_path / "out")
-    what = f"{arguments[0]} needs {library}, which is not installed"
+    words = line.format(tmp_path).split()
+    done = in_the_core(*words)
+    name = "data render" if words[0] == "data" else words[0]
+    what = f"{name} needs {library}, which is not installed"
     assert (done.returncode, done.stderr) == (2, f"gamba: {what}: {versions.to_install(extra)}\n")
     assert not (tmp_path / "out").exists()
 

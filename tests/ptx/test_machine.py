@@ -5,6 +5,7 @@ import operator
 import re
 import subprocess
 from fractions import Fraction
+from itertools import product
 from unittest.mock import Mock
 
 import numpy as np
@@ -36,12 +37,14 @@ def run(body, memory, threads=64, blocks=1, **options):
 
 
 # In these each thread writes what it reads of another's shared memory: of the next lane, or warp.
+STORE = "st.global.u32 [%rd4], %r1;"
 PUT, TAKE = "st.shared.u32 [%r4], %r1;", "ld.shared.u32 %r7, [%r6]; st.global.u32 [%rd4], %r7;"
 NEXT = f"xor.b32 %r5, %r2, 4; add.s32 %r6, %r3, %r5; {TAKE}"
 FAR = f"xor.b32 %r5, %r2, 128; add.s32 %r6, %r3, %r5; {TAKE}"
 ODD = "and.b32 %r5, %r1, 1; setp.eq.s32 %p1, %r5, 0;"
-VOTE = "vote.sync.ballot.b32 %r8, %p1, -1; st.global.u32 [%rd4], %r8;"
-RACE, UNWRITTEN = "race in shared memory", "depends on what nobody wrote"
+VOTE, SYNC = "vote.sync.ballot.b32 %r8, %p1, -1; st.global.u32 [%rd4], %r8;", "bar.sync 0;"
+RACE, UNWRITTEN, BOUNDS = "race in shared memory", "depends on what nobody wrote", "out of bounds"
+GLOBAL_RACE, DIVERGENT = "race in global memory", "divergent barrier"
 FAULTS = {
     "neighbour without a barrier": (PUT + NEXT, {RACE}),
     "neighbour after a barrier of the warp": (PUT + "bar.warp.sync -1;" + NEXT, set()),
@@ -50,41 +53,26 @@ FAULTS = {
     "a vote orders no memory": (PUT + ODD + VOTE + NEXT, {RACE}),
     "written after it was read": (PUT + "bar.sync 0;" + FAR + "st.shared.u32 [%r4], %r2;", {RACE}),
     "never written": ("bar.sync 0;" + FAR, {UNWRITTEN}),
-    "never written, never used": (
-        "ld.shared.u32 %r7, [%r4+512]; mov.u32 %r8, %r7; st.global.u32 [%rd4], %r1;",
-        set(),
-    ),
+    "never written, never used": ("ld.shared.u32 %r7, [%r4+512]; mov.u32 %r8, %r7;" + STORE, set()),
     "a branch by what was never written": (
         "ld.shared.u32 %r7, [%r4]; setp.eq.s32 %p1, %r7, 0; @%p1 bra $A; mov.u32 %r8, 0; $A:",
         {UNWRITTEN},
     ),
-    "past the end": ("st.global.u32 [%rd4+4], %r1;", {"out of bounds"}),
-    "before the beginning": (
-        "ld.global.u32 %r7, [%rd1+-4]; st.global.u32 [%rd4], %r7;",
-        {"out of bounds"},
-    ),
-    "past the end of shared memory": ("st.shared.u32 [%r4+2048], %r1;", {"out of bounds"}),
+    "past the end": ("st.global.u32 [%rd4+4], %r1;", {BOUNDS}),
+    "before the beginning": ("ld.global.u32 %r7, [%rd1+-4]; st.global.u32 [%rd4], %r7;", {BOUNDS}),
+    "past the end of shared memory": ("st.shared.u32 [%r4+2048], %r1;", {BOUNDS}),
     "misaligned": ("st.global.u32 [%rd1+2], %r1;", {"misaligned"}),
-    "half a warp at a barrier": (
-        ODD + "@%p1 bra $A; bar.sync 0; bra $B; $A: bar.sync 0; $B:",
-        {"divergent barrier"},
-    ),
-    "a guarded barrier": (ODD + "@%p1 bar.sync 0;", {"divergent barrier"}),
+    "half a warp at a barrier": (ODD + f"@%p1 bra $A; {SYNC} bra $B; $A: {SYNC} $B:", {DIVERGENT}),
+    "a guarded barrier": (ODD + "@%p1 bar.sync 0;", {DIVERGENT}),
     "half a warp votes": (ODD + f"@%p1 bra $A; {VOTE} bra $B; $A: {VOTE} $B:", {"deadlock"}),
     "a vote without its lanes": (
         ODD + "vote.sync.ballot.b32 %r8, %p1, 15; st.global.u32 [%rd4], %r8;",
         {"mask of lanes that are not there"},
     ),
-    "two blocks, one place": (
-        "add.s32 %r5, %r1, %r9; st.global.u32 [%rd4], %r5;",
-        {"race in global memory"},
-    ),
-    "two blocks, one value": ("st.global.u32 [%rd4], %r1;", set()),
+    "two blocks, one place": ("add.s32 %r5, %r1, %r9; st.global.u32 [%rd4], %r5;", {GLOBAL_RACE}),
+    "two blocks, one value": (STORE, set()),
     "atomic by two blocks": ("atom.global.add.u32 %r5, [%rd4], 1;", set()),
-    "atomic and not": (
-        "atom.global.add.u32 %r5, [%rd4], 1; st.global.u32 [%rd4], %r1;",
-        {"race in global memory"},
-    ),
+    "atomic and not": ("atom.global.add.u32 %r5, [%rd4], 1;" + STORE, {GLOBAL_RACE}),
     "no end": ("$A: bra $A;", {"no end"}),
 }
 
@@ -235,11 +223,8 @@ def test_a_count_at_a_barrier():
 def test_blocks_and_grids_of_three_dimensions():
     """Threads go by x, then y, then z, and so do blocks."""
     names = ("tid", "ntid", "ctaid", "nctaid")
-    body = "mov.u32 %r11, 0;" + "".join(
-        f"mov.u32 %r12, %{name}.{x}; mad.lo.s32 %r11, %r11, 7, %r12;"
-        for name in names
-        for x in "xyz"
-    )
+    mix = "mov.u32 %r12, %{}.{}; mad.lo.s32 %r11, %r11, 7, %r12;"
+    body = "mov.u32 %r11, 0;" + "".join(mix.format(*each) for each in product(names, "xyz"))
     body += """mov.u32 %r12, %tid.y; mov.u32 %r13, %tid.z; mad.lo.s32 %r12, %r13, 5, %r12;
     mad.lo.s32 %r12, %r12, 3, %r1; mov.u32 %r13, %ctaid.y; mov.u32 %r14, %ctaid.z;
     mad.lo.s32 %r13, %r14, 3, %r13; mad.lo.s32 %r13, %r13, 2, %r9; mad.lo.s32 %r12, %r13, 60, %r12;
@@ -247,13 +232,11 @@ def test_blocks_and_grids_of_three_dimensions():
     threads, blocks = (3, 5, 4), (2, 3, 2)
     memory, want = torch.zeros(60 * 12, dtype=torch.int32), []
     assert not run(body, memory, threads, blocks).findings
-    order = [(x, y, z) for z in range(4) for y in range(5) for x in range(3)]
-    for block in ((x, y, z) for z in range(2) for y in range(3) for x in range(2)):
-        for thread in order:
-            key = 0
-            for number in (*thread, *threads, *block, *blocks):
-                key = (key * 7 + number) % 2**32
-            want.append(key - 2**32 * (key >> 31))
+    for block, thread in product(np.ndindex(blocks[::-1]), np.ndindex(threads[::-1])):
+        key = 0
+        for number in (*thread[::-1], *threads, *block[::-1], *blocks):
+            key = (key * 7 + number) % 2**32
+        want.append(key - 2**32 * (key >> 31))
     assert memory.tolist() == want
     below = "mov.u32 %r5, %lanemask_lt; popc.b32 %r10, %r5;"
     assert lanes(below, 48) == [k % 32 for k in range(48)]
@@ -264,10 +247,9 @@ def test_halves_quotients_and_scopes():
     assert lanes(pack + "mov.u32 %r10, %r5;") == [lane | 3 << 16 for lane in range(32)]
     unpacked = "cvt.u32.u16 %r6, %h2; cvt.u32.u16 %r7, %h3; mad.lo.s32 %r10, %r6, 8, %r7;"
     assert lanes(pack + unpacked) == [8 * lane + 3 for lane in range(32)]
-    quotient = (
-        "mov.b32 %r5, 0f40E00000; mov.b32 %r6, 0f40000000; div.approx.ftz.f32 %r10, %r5, %r6;"
-    )
-    assert np.int32(lanes(quotient)[0]).view(np.float32) == 3.5
+    numbers = "mov.b32 %r5, 0f40E00000; mov.b32 %r6, 0f40000000;"
+    seven_halves = lanes(numbers + "div.approx.ftz.f32 %r10, %r5, %r6;")[0]
+    assert np.int32(seven_halves).view(np.float32) == 3.5
     shadowed = ODD + "{ .reg .pred %p1; .reg .b32 r; setp.ne.s32 %p1, %r1, %r1; mov.u32 r, 5; }"
     assert lanes(shadowed + "selp.u32 %r10, 1, 0, %p1;") == [1 - lane % 2 for lane in range(32)]
 
@@ -278,10 +260,9 @@ def test_halves_of_a_word_of_shared_memory():
     st.shared.u16 [%r6], %h1; {} xor.b32 %r5, %r5, 2; add.s32 %r6, %r3, %r5;
     ld.shared.u16 %h2, [%r6]; cvt.u32.u16 %r10, %h2;"""
     assert lanes(body.format("bar.warp.sync -1;")) == [lane ^ 1 for lane in range(32)]
-    found = run(
-        body.format("") + "st.global.u32 [%rd4], %r10;", torch.zeros(32, dtype=torch.int32), 32
-    )
-    assert {line.split(":")[0] for line in found.findings} <= {RACE, UNWRITTEN} and found.findings
+    memory, store = torch.zeros(32, dtype=torch.int32), "st.global.u32 [%rd4], %r10;"
+    found = run(body.format("") + store, memory, 32).findings
+    assert {line.split(":")[0] for line in found} <= {RACE, UNWRITTEN} and found
 
 
 WORDS = [0, 1, 2, 15, 16, 31, 32, 33, 63, 64, 0x7FFF, 0x8000, 0x7FFFFFFF, 0x80000000, 0xFFFFFFFF]
@@ -289,13 +270,8 @@ WORDS += [0x00000001, 0x007FFFFF, 0x00800000, 0x3F800000, 0x3FC00000, 0xBFC00000
 WORDS += [0x4F000000, 0xCF000000, 0x7F7FFFFF, 0x7F800000, 0xFF800000, 0x7FC00000, 0x3F807FFF]
 LONG = [x << 32 | 0x80000001 for x in (0, 1, 0x7FFFFFFF, 0x80000000, 0xFFFFFFFF)]
 DOUBLES = np.array([0, -0.0, 1, 1 + 2.0**-24, 1 + 3 * 2.0**-24, -3.5, 2.0**-149, 2.0**-127, 1e300])
-DOUBLES = [
-    *DOUBLES.view(np.uint64),
-    0x47EFFFFFE0000000,
-    0x47EFFFFFF0000000,
-    0x7FF << 52,
-    0x7FF8 << 48,
-]
+DOUBLES = [*DOUBLES.view(np.uint64), 0x47EFFFFFE0000000, 0x47EFFFFFF0000000]
+DOUBLES += [0x7FF << 52, 0x7FF8 << 48]
 
 
 def number(bits, kind):
@@ -367,8 +343,7 @@ def lowest(a, b):
     return (a if np.signbit(a) else b) if a == b else np.float32(np.fmin(float(a), float(b)))
 
 
-COMPARISONS = dict(eq=operator.eq, ne=operator.ne, lt=operator.lt, le=operator.le)
-COMPARISONS |= dict(gt=operator.gt, ge=operator.ge)
+COMPARISONS = {name: getattr(operator, name) for name in ("eq", "ne", "lt", "le", "gt", "ge")}
 INTEGERS = {
     "add": operator.add,
     "sub": operator.sub,
@@ -421,15 +396,10 @@ FLOATS = {
     "cvt.rpi": np.ceil,
     "cvt.rmi": np.floor,
     "cvt.sat": lambda a: np.float32(0) if np.isnan(a) else np.clip(a, 0, 1) + np.float32(0),
-    **{
-        f"setp.{k}": lambda a, b, f=f: f(a, b) and not np.isnan([a, b]).any()
-        for k, f in COMPARISONS.items()
-    },
-    **{
-        f"setp.{k}u": lambda a, b, f=f: f(a, b) or np.isnan([a, b]).any()
-        for k, f in COMPARISONS.items()
-    },
 }
+for key, compare in COMPARISONS.items():
+    FLOATS[f"setp.{key}"] = lambda a, b, f=compare: f(a, b) and not np.isnan([a, b]).any()
+    FLOATS[f"setp.{key}u"] = lambda a, b, f=compare: f(a, b) or np.isnan([a, b]).any()
 CONVERSIONS = {
     "cvt.rn.bf16.f32": lambda x: int(torch.tensor(x).bfloat16().view(torch.int16)),
     "cvt.rn.f16.f32": lambda x: int(np.float16(x).view(np.uint16)),
@@ -548,9 +518,8 @@ def test_operations_are_ptx(tmp_path):
     ptxas = cuda_tool("ptxas")
     if ptxas is None:
         pytest.skip("no ptxas")
-    entries = (
-        ENTRY.replace(" k(", f" k{i}(").format(body_of(x)) for i, x in enumerate(operations())
-    )
+    names = enumerate(operations())
+    entries = (ENTRY.replace(" k(", f" k{i}(").format(body_of(name)) for i, name in names)
     path = tmp_path / "k.ptx"
     path.write_text("\n".join([HEAD, *entries]))
     command = [ptxas, "--gpu-name=sm_90", "-O0", path, "-o", tmp_path / "k.cubin"]
