@@ -1,4 +1,4 @@
-"""Mamba's scan and block written out, for a comparison in float64."""
+"""Mamba's scan, block and layer, and Gamba's block, written out for a comparison in float64."""
 
 import torch
 import torch.nn.functional as F
@@ -130,3 +130,30 @@ def layer_in_float64(weights, tokens, discretization="mamba"):
     given |= {"delta_proj_weight": w["dt_proj_weight"], "delta_bias": w["dt_proj_bias"]}
     given |= {"discretization": discretization}
     return block_in_float64(**given, out_proj_weight=w["out_proj_weight"], out_proj_bias=0)
+
+
+def normalized(w, name, x):
+    """LayerNorm by its weights' names, or RMSNorm if it has no bias."""
+    x = x - x.mean(-1, keepdim=True) if f"{name}.bias" in w else x
+    x = x / (x.square().mean(-1, keepdim=True) + 1e-5).sqrt()
+    return x * w[f"{name}.weight"] + w.get(f"{name}.bias", 0)
+
+
+def part(w, name):
+    """Weights whose names begin so, under the rest of their names."""
+    return {k.removeprefix(name): x for k, x in w.items() if k.startswith(name)}
+
+
+def gamba_block_in_float64(w, discretization):
+    """Prepend the projected condition, compute the layer, drop the prefix again.
+
+    ``w`` has ``tokens``, those of ``camera`` and ``image`` that there are, and the block's weights.
+    """
+    layer, whole = part(w, "mamba."), [w["tokens"]]
+    layer |= {"conv1d.weight": layer["conv_weight"][:, None], "conv1d.bias": layer["conv_bias"]}
+    for name in ("image", "camera"):
+        if name in w:
+            project = part(w, f"project_{name}.")
+            whole.insert(0, w[name] @ project["weight"].T + project["bias"])
+    x = layer_in_float64(layer, normalized(w, "norm", torch.cat(whole, 1)), discretization)
+    return w["tokens"] + x[:, -w["tokens"].shape[1] :]

@@ -5,7 +5,7 @@ import math
 import pytest
 import torch
 from helpers import assert_rel_rms
-from helpers.mamba import TRANSITIONS, layer_in_float64
+from helpers.mamba import TRANSITIONS, gamba_block_in_float64
 from helpers.model import assert_plain_form, inputs, micro, moved_blocks, perturbed
 
 from gamba_warp.model.config import GambaConfig
@@ -18,28 +18,6 @@ from gamba_warp.model.parts.prefix import prefix_states
 def _config(**changes) -> GambaConfig:
     small = {"width": 24, "state_size": 5, "dt_rank": 3, "depth": 2, "encoder": "none"}
     return GambaConfig(**(small | changes))
-
-
-def _block_in_float64(block: GambaBlock, given: dict[str, torch.Tensor]) -> torch.Tensor:
-    """Prepend the projected condition, compute the layer, drop the prefix again.
-
-    Args:
-        block: for its kinds of norm and of discretization.
-        given: tokens, the condition and the block's parameters by name.
-    """
-    layer = {n.removeprefix("mamba."): x for n, x in given.items() if n.startswith("mamba.")}
-    layer |= {"conv1d.weight": layer["conv_weight"][:, None], "conv1d.bias": layer["conv_bias"]}
-    whole = [given["tokens"]]
-    for name in ("image", "camera"):
-        if name in given:
-            weight, bias = given[f"project_{name}.weight"], given[f"project_{name}.bias"]
-            whole.insert(0, given[name] @ weight.T + bias)
-    x = torch.cat(whole, 1)
-    if isinstance(block.norm, torch.nn.LayerNorm):
-        x = x - x.mean(-1, keepdim=True)
-    x = x / (x.square().mean(-1, keepdim=True) + 1e-5).sqrt() * given["norm.weight"]
-    x = layer_in_float64(layer, x + given.get("norm.bias", 0), block.mamba.discretization)
-    return given["tokens"] + x[:, -given["tokens"].shape[1] :]
 
 
 def _run(block: GambaBlock, tokens, camera, image) -> torch.Tensor:
@@ -65,7 +43,7 @@ def test_the_block_and_its_gradients_are_those_of_float64(changes, camera, image
     leaves |= dict(block.named_parameters())
     wide = {name: x.detach().double().requires_grad_() for name, x in leaves.items()}
     got = _run(block, given["tokens"], given.get("camera"), given.get("image"))
-    want = _block_in_float64(block, wide)
+    want = gamba_block_in_float64(wide, block.mamba.discretization)
     assert_rel_rms(got, want, 2e-6, "block")  # float32 against float64
     cotangent = torch.randn_like(got)
     grads = torch.autograd.grad(got, [*leaves.values()], cotangent)
