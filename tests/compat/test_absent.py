@@ -105,9 +105,8 @@ def test_a_name_is_an_import_error_where_the_program_catches_it(
 
 def test_the_import_error_says_what_is_missing(tmp_path):
     client, package = tmp_path / "client.py", mamba_ssm.__name__
-    client.write_text(
-        f"try:\n from {package} import (Mamba,\n  Mamba2)\nexcept ImportError as e:\n text = str(e)"
-    )
+    guarded = f"try:\n from {package} import (Mamba,\n  Mamba2)\n"
+    client.write_text(guarded + "except ImportError as e:\n text = str(e)")
     space = runpy.run_path(str(client))
     assert space["text"] == "mamba-ssm's Mamba2 is not here: only its Mamba-1 is"
 
@@ -125,28 +124,20 @@ def test_nothing_of_gsplat_is_missing():
     for path in ("", "rendering", "utils", "cuda._wrapper", "distributed", "optimizers"):
         theirs = importlib.import_module(f"gsplat.{path}".rstrip("."))
         ours = importlib.import_module(f"{gsplat.__name__}.{path}".rstrip("."))
-        names = {
-            name
-            for name, value in vars(theirs).items()
-            if callable(value) and not name.startswith("_")
-            if (path == "" or value.__module__ == theirs.__name__)
-        }
+        public = {k: x for k, x in vars(theirs).items() if callable(x) and k[0] != "_"}
+        names = {k for k, x in public.items() if path == "" or x.__module__ == theirs.__name__}
         assert {name for name in names if not hasattr(ours, name)} == set()
 
 
 def test_a_guard_around_the_import_of_another_module(tmp_path, monkeypatch):
     """Takes its other way where one that is imported there lacks a name."""
-    (tmp_path / "own_layers.py").write_text(
-        "from gamba_warp.compat.mamba_ssm import Mamba2\n\nclass Mine:\n    pass\n"
-    )
+    layers = "from gamba_warp.compat.mamba_ssm import Mamba2\n\nclass Mine:\n    pass\n"
+    (tmp_path / "own_layers.py").write_text(layers)
     (tmp_path / "own_models.py").write_text("from own_layers import Mine\n")
     monkeypatch.syspath_prepend(tmp_path)
-    space: dict = {}
+    words = {"head": "try:", "handler": "except ImportError:", "package": "own_models"}
     path = tmp_path / "client.py"
-    path.write_text(
-        "try:\n    from own_models import Mine\nexcept ImportError:\n    Mine = None\n"
-        "import own_layers\n"
-    )
+    path.write_text(BODY.format(**words, name="Mine") + "\nimport own_layers\n")
     space = runpy.run_path(str(path))
     assert space["Mine"] is None and space["own_layers"].Mine is not None
 

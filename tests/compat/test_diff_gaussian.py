@@ -2,12 +2,12 @@
 
 import inspect
 import math
-import subprocess
 
 import pytest
 import torch
 from helpers import assert_rel_rms
 from helpers import first_splatting as first
+from helpers.children import ran
 from helpers.first_splatting import CASES, draw, draw_first, scene_of, settings_of
 from helpers.forked import python
 
@@ -279,8 +279,7 @@ print(image.shape, float(depth.max() / alpha.max()), importlib.metadata.version(
 def test_a_program_takes_the_names_and_a_fork(tmp_path):
     path = tmp_path / "client.py"
     path.write_text(PROGRAM)
-    command = [python(), "-m", "gamba_warp.compat", "--fork", "ashawkey", str(path)]
-    done = subprocess.run(command, capture_output=True, text=True)
+    done = ran(python(), "-m", "gamba_warp.compat", "--fork", "ashawkey", path)
     assert not done.returncode, done.stderr
     lines = done.stdout.splitlines()
     assert "without it" in lines and lines[-1] == "torch.Size([3, 8, 8]) 2.0 0.0.0"

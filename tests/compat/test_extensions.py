@@ -1,11 +1,10 @@
 """The extension modules that layers call themselves, by every version's arguments."""
 
-import subprocess
-
 import pytest
 import torch
 import torch.nn.functional as F
 from helpers import assert_all_rel_rms, assert_rel_rms, mamba
+from helpers.children import ran
 from helpers.forked import python
 from helpers.mamba import BATCH, CHANNELS, LENGTH
 
@@ -110,9 +109,8 @@ def test_the_convolution_of_every_version(silu):
             into[3] = into[3] if before is first else None
             dx = torch.empty_like(x)
             forms = [(None, initial, ends, dx, initial is not None), (None, initial, ends, *into)]
-            for rest in (
-                forms if ends is not None or before is first else [(dx,), (None, dx), *forms]
-            ):
+            oldest = [] if ends is not None or before is first else [(dx,), (None, dx)]
+            for rest in (*oldest, *forms):
                 got = conv.causal_conv1d_bwd(x, weight, bias, dout, *rest, silu)
                 assert len(got) == (3 if len(rest) < 3 else 4)
                 for name, value, exact in zip(("x", "weight", "bias", "initial"), got, want):
@@ -183,6 +181,6 @@ print(fwd.__module__, {"mamba_ssm", "gsplat"} & {*sys.modules}, *sys.argv[1:])
 
 def test_a_program_gets_them_by_name(tmp_path):
     (tmp_path / "client.py").write_text(CLIENT)
-    command = [python(), "-m", "gamba_warp.compat", "--take", ",".join(EXTENSIONS)]
-    done = subprocess.run([*command, tmp_path / "client.py", "3"], capture_output=True, text=True)
+    words = ("--take", ",".join(EXTENSIONS), tmp_path / "client.py", 3)
+    done = ran(python(), "-m", "gamba_warp.compat", *words)
     assert done.stdout == "gamba_warp.compat.extensions set() 3\n", done.stderr

@@ -21,18 +21,22 @@ if importlib.util.find_spec("gsplat") is None:
 from gsplat.cuda import _torch_impl as gsplat
 
 
+def alphas_of(means2d, conics, opacities, width, height):
+    """Alphas ``[H W, N]`` before any cut; conics are gsplat's xx, xy, yy."""
+    y, x = torch.meshgrid(torch.arange(height) + 0.5, torch.arange(width) + 0.5, indexing="ij")
+    dx, dy = (torch.stack([x, y], -1).view(-1, 1, 2) - means2d).unbind(-1)
+    xx, xy, yy = conics.unbind(-1)
+    return opacities * torch.exp(-0.5 * (xx * dx * dx + 2 * xy * dx * dy + yy * dy * dy))
+
+
 def weights_by_pixel(means2d, conics, opacities, width, height):
     """Centres of every pixel by itself ``[H W, N, 2]`` and their weights ``[H W, N]``, in float64.
 
     Gaussians come front to back; conics are gsplat's xx, xy, yy. The gradient of the centres, a
     leaf, has a row for each pixel.
     """
-    y, x = torch.meshgrid(torch.arange(height) + 0.5, torch.arange(width) + 0.5, indexing="ij")
     each = means2d.detach().double().expand(height * width, *means2d.shape).clone().requires_grad_()
-    d = torch.stack([x, y], -1).view(-1, 1, 2) - each
-    xx, xy, yy = conics.double().unbind(-1)
-    q = xx * d[..., 0] ** 2 + 2 * xy * d[..., 0] * d[..., 1] + yy * d[..., 1] ** 2
-    alpha = (opacities.double() * torch.exp(-0.5 * q)).clamp_max(0.999)
+    alpha = alphas_of(each, conics.double(), opacities.double(), width, height).clamp_max(0.999)
     alpha = torch.where(alpha >= ALPHA_MIN, alpha, 0.0)
     after = (1 - alpha).cumprod(1)
     return each, torch.where(after > 1e-4, after / (1 - alpha) * alpha, 0.0)
@@ -42,10 +46,7 @@ def nerfacc():
     """The two functions of nerfacc that gsplat's ``accumulate`` asks for; pairs come ray by ray."""
 
     def render_weight_from_alpha(alphas, ray_indices, n_rays):
-        order = torch.arange(len(alphas))
-        first = torch.full((n_rays,), len(alphas)).scatter_reduce(
-            0, ray_indices, order, "amin", include_self=True
-        )
+        first = torch.searchsorted(ray_indices, torch.arange(n_rays))
         light = torch.log1p(-alphas)
         before = torch.cumsum(light, 0) - light
         transmittances = torch.exp(before - before[first[ray_indices]])
@@ -69,12 +70,8 @@ def visible_pairs(projected, opacities, width, height):
     order = torch.argsort(depths.view(images, num), stable=True)
     parts = []
     for image in range(images):
-        y, x = torch.meshgrid(torch.arange(height), torch.arange(width), indexing="ij")
-        pixels = torch.stack([x, y], -1).view(-1, 1, 2) + 0.5
-        d = pixels - means2d[image, order[image]]
-        a, b, c = conics[image, order[image]].unbind(-1)
-        q = a * d[..., 0] ** 2 + 2 * b * d[..., 0] * d[..., 1] + c * d[..., 1] ** 2
-        alpha = opacities.reshape(images, num)[image, order[image]] * torch.exp(-0.5 * q)
+        own = (x[image, order[image]] for x in (means2d, conics, opacities.view(images, num)))
+        alpha = alphas_of(*own, width, height)
         pixel, rank = (alpha >= ALPHA_MIN).nonzero(as_tuple=True)
         parts.append((order[image][rank], pixel, torch.full_like(pixel, image)))
     return tuple(torch.cat(p) for p in zip(*parts))
@@ -248,10 +245,8 @@ def blended(monkeypatch, scene, channels):
     monkeypatch.setitem(sys.modules, "nerfacc", nerfacc())
     projected = project(scene)
     num = scene["means"].shape[-2]
-    opacities, colors = (
-        scene["opacities"][:, None].repeat(1, 2, 1),
-        torch.randn(1, 2, num, channels),
-    )
+    opacities = scene["opacities"][:, None].repeat(1, 2, 1)
+    colors = torch.randn(1, 2, num, channels)
     parts = dict(means2d=projected[1], conics=projected[3], opacities=opacities, colors=colors)
     got, want = twice({**parts, "backgrounds": torch.rand(1, 2, channels)})
     with torch.no_grad():
@@ -277,10 +272,8 @@ def test_pixels(monkeypatch, tile, channels, packed):
         seen = (projected[0] > 0).all(-1)
         given = [x[seen] for x in given]
         rows = (seen.flatten().cumsum(0) - 1)[rows.long()].int()
-    size = WIDTH, HEIGHT, tile
-    found, alpha = compat.rasterize_to_pixels(
-        *given, *size, offsets, rows, got["backgrounds"], packed=packed
-    )
+    lists = WIDTH, HEIGHT, tile, offsets, rows
+    found, alpha = compat.rasterize_to_pixels(*given, *lists, got["backgrounds"], packed=packed)
     assert 0.1 < alphas.mean() and alphas.max() < 0.9999
     assert (found - expected).abs().max() < 3 * EXACT  # colours of size 3
     assert (alpha - alphas).abs().max() < EXACT
@@ -336,10 +329,9 @@ def test_refusals():
             call(*given, WIDTH, HEIGHT, **{name: value})
     with pytest.raises(ValueError, match="covars must have shape"):
         call(scene["means"], torch.zeros(1, 3, 3, 3), *given[2:], WIDTH, HEIGHT)
-    with pytest.raises(
-        ValueError, match="camera_model is supported only as 'pinhole', got 'ortho'"
-    ):
-        compat.proj(torch.zeros(1, 1, 3), torch.zeros(1, 1, 3, 3), scene["Ks"][0], 4, 4, "ortho")
+    points = torch.zeros(1, 1, 3), torch.zeros(1, 1, 3, 3), scene["Ks"][0]
+    with pytest.raises(ValueError, match="camera_model is .* only as 'pinhole', got 'ortho'"):
+        compat.proj(*points, 4, 4, "ortho")
     parts = torch.zeros(1, 3, 2), torch.ones(1, 3, 3), torch.zeros(1, 3, 3), torch.zeros(1, 3)
     lists = torch.zeros(1, 1, 1, dtype=torch.int32), torch.tensor([3], dtype=torch.int32)
     with pytest.raises(ValueError, match="flatten_ids goes from 3 to 3"):

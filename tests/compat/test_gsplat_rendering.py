@@ -182,10 +182,8 @@ def test_simple_trainer(packed):
     scene["means"][:9] *= 30
     params = {name: torch.nn.Parameter(scene[name].clone()) for name in ("means", "colors")}
     lr, eps, betas = 0.01, 1e-8, (0.9, 0.999)
-    optimizers = [
-        gsplat.SelectiveAdam([{"params": x, "lr": lr, "name": name}], eps=eps, betas=betas)
-        for name, x in params.items()
-    ]
+    groups = ({"params": x, "lr": lr, "name": name} for name, x in params.items())
+    optimizers = [gsplat.SelectiveAdam([group], eps=eps, betas=betas) for group in groups]
     want = {name: (x.detach().double(), 0.0, 0.0) for name, x in params.items()}
     for _ in range(2):
         given = {**scene, **params}

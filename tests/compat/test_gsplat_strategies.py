@@ -4,6 +4,7 @@ import importlib.util
 import math
 import runpy
 from pathlib import Path
+from unittest.mock import Mock
 
 import pytest
 import torch
@@ -97,9 +98,8 @@ TIMES = dict(refine_start_iter=3, refine_stop_iter=25, refine_every=5)
 def test_default_strategy(packed, absgrad):
     from gamba_warp.compat.gsplat import DefaultStrategy
 
-    strategy = DefaultStrategy(
-        absgrad=absgrad, grow_grad2d=2e-3, refine_scale2d_stop_iter=20, **TIMES
-    )
+    growth = {"absgrad": absgrad, "grow_grad2d": 2e-3, "refine_scale2d_stop_iter": 20}
+    strategy = DefaultStrategy(**growth, **TIMES)
     state = strategy.initialize_state(scene_scale=1.0)
     counts, losses, _ = fitted(strategy, state, dict(packed=packed, absgrad=absgrad), packed=packed)
     changes = torch.tensor(counts).diff()
@@ -114,18 +114,14 @@ def test_mcmc_strategy(monkeypatch):
 
     from gamba_warp.compat.gsplat import MCMCStrategy
 
-    moved = []
-    relocate = mcmc.relocate
-    monkeypatch.setattr(
-        mcmc, "relocate", lambda **k: (moved.append(int(k["mask"].sum())), relocate(**k))
-    )
+    relocate = Mock(wraps=mcmc.relocate)
+    monkeypatch.setattr(mcmc, "relocate", relocate)
     theirs = ops.compute_relocation
     strategy = MCMCStrategy(cap_max=300, noise_lr=1.0, **TIMES)
-    counts, losses, params = fitted(
-        strategy, strategy.initialize_state(), dict(packed=False), lr=0.02
-    )
+    state = strategy.initialize_state()
+    counts, losses, params = fitted(strategy, state, dict(packed=False), lr=0.02)
     assert counts[0] == 250 and counts[5] == 262 and counts[-1] == 300
-    assert moved and moved[0] >= 20
+    assert relocate.call_args_list[0].kwargs["mask"].sum() >= 20
     assert (params["opacities"].sigmoid() > 0.004).all(), "the dead ones live elsewhere now"
     assert losses[-1] < 0.5 * losses[0]
     assert ops.compute_relocation is theirs, "what was replaced is put back"

@@ -191,9 +191,8 @@ def test_dropout_is_that_of_its_masks():
     x, x1, residual = torch.randn(3, 64, 32, 17)
     weight, weight1 = torch.rand(2, 17)
     given = {"residual": residual, "x1": x1, "weight1": weight1, "dropout_p": 0.25}
-    *outs, total, mask, mask1 = norms.layer_norm_fn(
-        x, weight, None, **given, prenorm=True, return_dropout_mask=True
-    )
+    given |= {"prenorm": True, "return_dropout_mask": True}
+    *outs, total, mask, mask1 = norms.layer_norm_fn(x, weight, None, **given)
     for kept in (mask, mask1):
         assert kept.dtype == torch.bool and abs(kept.float().mean() - 0.75) < 0.02
     assert not torch.equal(mask, mask1)

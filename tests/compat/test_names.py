@@ -1,11 +1,11 @@
 """Programs that import mamba_ssm, causal_conv1d and gsplat get our modules."""
 
 import importlib.util
-import subprocess
 import sys
 
 import pytest
 import torch
+from helpers.children import ran
 from helpers.forked import python
 
 from gamba_warp.compat import VERSIONS, causal_conv1d, gsplat, mamba_ssm, take_names
@@ -51,16 +51,10 @@ assert all(x.__module__ == "gamba_warp.compat.gsplat.relocation" for x in ours)
 """
 
 
-def run(*arguments):
-    """Run a new process, because names can be taken once per process."""
-    command = [python(), "-m", "gamba_warp.compat", *map(str, arguments)]
-    return subprocess.run(command, capture_output=True, text=True)
-
-
 def test_a_program_gets_our_interfaces_under_their_names(tmp_path):
     path = tmp_path / "client.py"
     path.write_text(PROGRAM + (OF_GSPLAT if importlib.util.find_spec("gsplat") else ""))
-    done = run(path, "--steps", 3)
+    done = ran(python(), "-m", "gamba_warp.compat", path, "--steps", 3)
     assert not done.returncode, done.stderr
     assert done.stdout.splitlines() == [
         f"{path} --steps 3 __main__",

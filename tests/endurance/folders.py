@@ -19,13 +19,10 @@ _ENDS |= dict.fromkeys((".json", ".jsonl", ".md", ".csv"), b"\n")
 
 def contents(folder: Path) -> dict[str, bytes]:
     """Files of a folder by their path in it, without leftovers and TensorBoard's, named by time."""
-    found = sorted(path for path in folder.rglob("*") if path.is_file())
-    named = {path.relative_to(folder): path for path in found if "tfevents" not in path.name}
-    return {
-        relative.as_posix(): path.read_bytes()
-        for relative, path in named.items()
-        if not any(part.startswith(".") for part in relative.parts)
-    }
+    files = (path.relative_to(folder) for path in sorted(folder.rglob("*")) if path.is_file())
+    kept = (path for path in files if "tfevents" not in path.name)
+    kept = (path for path in kept if not any(part.startswith(".") for part in path.parts))
+    return {path.as_posix(): (folder / path).read_bytes() for path in kept}
 
 
 def leftovers(folder: Path) -> list[Path]:
@@ -44,12 +41,9 @@ def age(folder: Path) -> None:
 
 def lost(before: dict[str, bytes], after: dict[str, bytes]) -> list[str]:
     """Names of files that have disappeared, or are neither unchanged nor complete."""
-    return [
-        name
-        for name in sorted(before.keys() | after.keys())
-        if name not in after
-        or (after[name] != before.get(name) and not is_whole(name, after[name]))
-    ]
+    changed = {name for name in after if after[name] != before.get(name)}
+    broken = {name for name in changed if not is_whole(name, after[name])}
+    return sorted(broken | (before.keys() - after.keys()))
 
 
 def is_whole(name: str, data: bytes) -> bool:

@@ -39,9 +39,8 @@ class Opened:
     def promised(self, expression: str, seconds: float = 30.0) -> Any:
         """Return the value of a JavaScript promise; a pending one fails the test."""
         late = f"setTimeout(() => fail(new Error('no answer')), {1000 * seconds})"
-        return self.page.evaluate(
-            f"() => Promise.race([{expression}, new Promise((_, fail) => {late})])"
-        )
+        race = f"Promise.race([{expression}, new Promise((_, fail) => {late})])"
+        return self.page.evaluate(f"() => {race}")
 
     def until(self, expression: str, seconds: float = 30.0) -> None:
         """Wait until an expression of JavaScript is true, whatever the page's policy allows."""
@@ -96,10 +95,9 @@ def browser_page(browser) -> Iterator[Callable[..., Opened]]:
         contexts.append(context)
         context.set_default_timeout(30_000)
         result = Opened(context.new_page())
-        result.page.on(
-            "console", lambda message: complains(message) and result.messages.append(message.text)
-        )
-        result.page.on("pageerror", lambda error: result.messages.append(str(error)))
+        note = result.messages.append
+        result.page.on("console", lambda message: complains(message) and note(message.text))
+        result.page.on("pageerror", lambda error: note(str(error)))
         result.page.goto(place.resolve().as_uri() if isinstance(place, Path) else place)
         return result
 

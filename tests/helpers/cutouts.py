@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import io
 from dataclasses import dataclass
+from itertools import product
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -104,12 +105,8 @@ def cases() -> list[Case]:
 
 def near_white() -> list[Case]:
     """Make light grey objects on white: parts look like the background or enclose it."""
-    grounds = list(_GROUNDS)[:2]
-    return [
-        _case(f"mug {seed} of {shade}", True, ground, False)
-        for seed in range(7)
-        for shade, ground in zip((0.88, 0.93), grounds)
-    ]
+    kinds = product(range(7), zip((0.88, 0.93), _GROUNDS))
+    return [_case(f"mug {seed} of {shade}", True, at, False) for seed, (shade, at) in kinds]
 
 
 def iou(found: np.ndarray | None, right: np.ndarray) -> float:

@@ -61,15 +61,7 @@ class Factor(torch.autograd.Function):
         return tuple(v * slope for slope in slopes)
 
 
-def render(
-    means: Tensor,
-    means2d: Tensor,
-    opacities: Tensor,
-    colors: Tensor,
-    covars: Tensor,
-    settings,
-    antialiasing: bool = False,
-) -> dict[str, Tensor]:
+def render(means, means2d, opacities, colors, covars, settings, antialiasing=False):
     """``color [C, H, W]``, ``depth``, ``inverse`` and ``alpha [H, W]``; ``radii, touched [N]``.
 
     Args:
@@ -101,13 +93,11 @@ def render(
     held = (slopes.clamp(-bound, bound) * z[:, None]).detach()
     x, y = torch.where(outside, held, t[:, :2]).unbind(-1)
     nothing = torch.zeros_like(z)
-    J = torch.stack(
-        [
-            torch.stack([focal[0] / z, nothing, -focal[0] * x / z**2], -1),
-            torch.stack([nothing, focal[1] / z, -focal[1] * y / z**2], -1),
-        ],
-        -2,
+    rows = (
+        [focal[0] / z, nothing, -focal[0] * x / z**2],
+        [nothing, focal[1] / z, -focal[1] * y / z**2],
     )
+    J = torch.stack([torch.stack(row, -1) for row in rows], -2)
     M = J @ view[:3, :3].T
     plane = M @ covars @ M.mT
     xx, xy, yy = plane[:, 0, 0], plane[:, 0, 1], plane[:, 1, 1]

@@ -24,22 +24,12 @@ def camera(number: int) -> dict:
     azimuth = math.radians(15.0 * number if number < 25 else 30.0 * (number - 27))
     elevation = math.radians(ELEVATION[number])
     distance = 1.2 + 0.01 * number
-    back = np.array(
-        [
-            math.cos(azimuth) * math.cos(elevation),
-            math.sin(azimuth) * math.cos(elevation),
-            math.sin(elevation),
-        ]
-    )
+    flat, height = math.cos(elevation), math.sin(elevation)
+    back = np.array([math.cos(azimuth) * flat, math.sin(azimuth) * flat, height])
     right = np.array([-math.sin(azimuth), math.cos(azimuth), 0.0])
     down = np.cross(right, back)
-    return {
-        "x": right.tolist(),
-        "y": down.tolist(),
-        "z": (-back).tolist(),
-        "origin": (distance * back).tolist(),
-        "distance": distance,
-    }
+    vectors = {"x": right, "y": down, "z": -back, "origin": distance * back}
+    return {name: x.tolist() for name, x in vectors.items()} | {"distance": distance}
 
 
 def files_of(number: int) -> dict[str, bytes]:

@@ -22,10 +22,8 @@ ALONE = World(0, 1, torch.device("cpu"))
 SIZE = 16
 VIEWS = 6
 # One narrow block and 64 Gaussians.
-MODEL = (
-    f"image_size={SIZE}",
-    *"patch_size=4 width=16 depth=1 state_size=4 scale_init=0.06".split(),
-)
+NARROW = f"image_size={SIZE} patch_size=4 width=16 depth=1 state_size=4 scale_init=0.06"
+MODEL = tuple(NARROW.split())
 
 
 def cloud(seed: int, num: int = 40) -> Gaussians:

@@ -17,9 +17,8 @@ FIELDS = ("means", "scales", "opacities", "colors")
 NOTHING = slice(0, 0), slice(0, 0)
 # Random noise has no flat cells; a disc on the left, one pixel, a square that touches two sides.
 BOXES = [(slice(5, 9), slice(1, 5)), (slice(7, 8), slice(10, 11)), (slice(0, 12), slice(4, 12))]
-SMALLEST = GambaConfig(
-    image_size=16, patch_size=4, width=16, depth=1, encoder="none", encoder_size=16
-)
+SIZES = dict(image_size=16, patch_size=4, width=16, depth=1, encoder_size=16)
+SMALLEST = GambaConfig(**SIZES, encoder="none")
 
 
 @timm.models.register_model
@@ -72,10 +71,8 @@ def assert_plain_form(plain, blocks, length: int, camera: int, image, tolerance:
     ``camera`` is the channels of the camera's token, ``image`` the shape of the image's.
     """
     width = blocks[0].norm.weight.numel()
-    tokens = torch.randn(2, length, width)
-    condition = [
-        torch.randn(2, *shape) if shape[-1] else None for shape in ((1, camera), tuple(image))
-    ]
+    tokens, shapes = torch.randn(2, length, width), ((1, camera), tuple(image))
+    condition = [torch.randn(2, *shape) if shape[-1] else None for shape in shapes]
     given = dict(zip(("tokens", "camera", "image"), (tokens, *condition)))
     leaves = {name: leaf.requires_grad_() for name, leaf in given.items() if leaf is not None}
     named = leaves | dict(blocks.named_parameters())

@@ -179,9 +179,8 @@ def test_what_only_an_option_needs(tmp_path):
     save_image(tmp_path / "busy.png", disc_on_noise((60, 80))[0])
     quick = ("--turntable", "none", "--no-page", "--out", tmp_path / "out")
     done = in_the_core("reconstruct", image, "--matte-model", "model.onnx", *quick)
-    assert done.returncode == 2 and done.stderr.strip().splitlines()[-1].endswith(
-        f"needs onnxruntime, which is not installed: {versions.to_install('photo')}"
-    ), done.stderr
+    what = f"needs onnxruntime, which is not installed: {versions.to_install('photo')}\n"
+    assert done.returncode == 2 and done.stderr.endswith(what), done.stderr
     done = in_the_core("reconstruct", tmp_path / "busy.png", *quick)
     assert done.returncode == 0 and "GrabCut cut the object out" in done.stdout, done.stderr
     assert versions.to_install("photo") in done.stderr

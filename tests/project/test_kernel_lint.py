@@ -1,9 +1,9 @@
 """Rules of kernel_lint.py: the tree obeys them, and violations are found."""
 
-import subprocess
 import sys
 
 import pytest
+from helpers.children import ran
 from project import kernel_lint
 from project.kernel_lint import findings
 
@@ -34,7 +34,7 @@ def test_what_keeps_the_rules_is_not_found():
 
 
 def test_the_kernels_keep_the_rules():
-    done = subprocess.run([sys.executable, kernel_lint.__file__], capture_output=True, text=True)
+    done = ran(sys.executable, kernel_lint.__file__)
     assert (done.returncode, done.stderr) == (0, "")
 
 

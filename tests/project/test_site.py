@@ -2,7 +2,6 @@
 
 import os
 import re
-import subprocess
 import sys
 from html.parser import HTMLParser
 from pathlib import Path
@@ -123,8 +122,7 @@ def slurm(folder, *arguments, script=SCRIPT, **more):
         (folder / name).chmod(0o755)
     place = {"PATH": f"{folder}:{os.environ['PATH']}", "SLURM_JOB_ID": "41234"}
     place |= {"SLURM_JOB_NODELIST": "node[7-8]", "SLURM_NNODES": "2", **more}
-    command = ["bash", str(script), *arguments]
-    return subprocess.run(command, env=place, capture_output=True, text=True, timeout=60)
+    return ran("bash", script, *arguments, env=place, timeout=60)
 
 
 def test_the_slurm_script_starts_torchrun_on_each_machine(tmp_path):

@@ -66,9 +66,8 @@ def _read(elf: bytes) -> dict[str, Resources]:
         name = text(elf, strings + name)
         data[name] = b"" if kind == _EMPTY else elf[offset : offset + size]
         sizes[name] = size
-    symbols = [
-        text(data[".strtab"], name) for name, _ in np.frombuffer(data[".symtab"], _SYMBOL).tolist()
-    ]
+    listed = np.frombuffer(data[".symtab"], _SYMBOL).tolist()
+    symbols = [text(data[".strtab"], name) for name, _ in listed]
     found: dict[int, dict[str, int]] = {_REGISTERS: {}, _FRAME: {}}
     info, at = data.get(".nv.info", b""), 0
     while at < len(info):

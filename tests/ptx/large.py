@@ -108,9 +108,8 @@ def far(x, dim, path):
 @pytest.mark.parametrize(("dim", "shape"), [(0, (4, 70, 37)), (1, (1, 6, 37))])
 def test_strides_near_the_limit(monkeypatch, tmp_path, dim, shape, dtype, segments):
     """The bits are those of dense tensors, and nothing beside the tensors is touched."""
-    monkeypatch.setattr(
-        scan_cuda, "choose", lambda *_: Tuning(segments=segments, back_segments=segments)
-    )
+    tuning = Tuning(segments=segments, back_segments=segments)
+    monkeypatch.setattr(scan_cuda, "choose", lambda *_: tuning)
     cotangent = torch.randn(shape).to(dtype)
     cases = (
         (lambda x: selective_scan(**x, delta_softplus=True), scans.make(*shape, 3, dtype=dtype)),

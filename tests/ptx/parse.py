@@ -148,9 +148,8 @@ class _Entry:
             except (AttributeError, KeyError, ValueError, IndexError) as error:
                 raise Refused(f"{program.name}: {statement!r}: {error!r}") from error
         kinds = [opcodes()[name][0] for name in ("ld", "st")]
-        if any(
-            i.op in kinds and SPACES[i.space] in ("", "shared") and i.size < 4 for i in program.code
-        ):
+        accesses = (i for i in program.code if i.op in kinds and SPACES[i.space] in ("", "shared"))
+        if any(i.size < 4 for i in accesses):
             program.shared_unit = 1
         program.special = [self.registers.get(name, (-1,))[0] for name in SPECIAL]
         found = [(at, value, wide) for (value, wide), at in self.constants.items()]

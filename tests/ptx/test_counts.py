@@ -23,9 +23,8 @@ def test_the_counts_are_of_these_kernels(case):
 
 def test_known_counts():
     """Exponentials, products and bytes are those that the sources state."""
-    forward, back = (
-        KERNELS[k, "bfloat16", "(b, "]["each"] for k in ("scan_forward", "scan_backward")
-    )
+    names = ("scan_forward", "scan_backward")
+    forward, back = (KERNELS[name, "bfloat16", "(b, "]["each"] for name in names)
     # a state's decay; softplus and gate are of 16 states
     assert forward["special"] == 1 + 4 / 16
     # states recomputed but for the last 4 of 64 tokens, and the gradient; softplus, its slope, gate

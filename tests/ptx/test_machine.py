@@ -3,7 +3,6 @@
 import ctypes
 import operator
 import re
-import subprocess
 from fractions import Fraction
 from itertools import product
 from unittest.mock import Mock
@@ -11,6 +10,7 @@ from unittest.mock import Mock
 import numpy as np
 import pytest
 import torch
+from helpers.children import ran
 from helpers.kernels import plain_kernel
 
 from . import launch as launching
@@ -522,8 +522,7 @@ def test_operations_are_ptx(tmp_path):
     entries = (ENTRY.replace(" k(", f" k{i}(").format(body_of(name)) for i, name in names)
     path = tmp_path / "k.ptx"
     path.write_text("\n".join([HEAD, *entries]))
-    command = [ptxas, "--gpu-name=sm_90", "-O0", path, "-o", tmp_path / "k.cubin"]
-    done = subprocess.run(command, capture_output=True, text=True)
+    done = ran(ptxas, "--gpu-name=sm_90", "-O0", path, "-o", tmp_path / "k.cubin")
     assert done.returncode == 0, done.stderr
 
 
@@ -569,9 +568,8 @@ def check_operation(name):
     kind = words[-1]
     table = FLOATS if kind in ("f32", "f64") else INTEGERS
     stem = ".".join([first, *words[:-1]])
-    function = (
-        CONVERSIONS.get(name) or table.get(stem) or table.get(re.sub(r"\.(rn|f32)$", "", stem))
-    )
+    plain = re.sub(r"\.(rn|f32)$", "", stem)
+    function = CONVERSIONS.get(name) or table.get(stem) or table.get(plain)
     result, source = kind, kind.removesuffix(" of 64")
     if first == "setp":
         result = "pred"

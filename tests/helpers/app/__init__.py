@@ -47,13 +47,9 @@ def command(*options) -> list[str]:
 def serving(temporary: Path) -> Iterator[Served]:
     """Start the command like a user, with its own folder for temporary files."""
     environment = {**os.environ, "TMPDIR": str(temporary), "HTTP_PROXY": "http://127.0.0.1:9"}
-    process = subprocess.Popen(
-        command("--port", 0, "--max-upload-mb", MEGABYTES, "--device", "cpu"),
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-        env=environment,
-    )
+    words = command("--port", 0, "--max-upload-mb", MEGABYTES, "--device", "cpu")
+    pipes: dict[str, Any] = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
+    process = subprocess.Popen(words, env=environment, **pipes)
     lines = [process.stdout.readline() for _ in range(4)]
     match = re.match(r"(http://127\.0\.0\.1:\d+/\?token=\S+) \(Ctrl-C ends it\)$", lines[-1])
     assert match, "".join(lines) + process.communicate(timeout=10)[1]

@@ -1,9 +1,10 @@
 """Training in several processes like those of torchrun, each with its own options."""
 
 import os
+import signal
 import socket
 import subprocess
-import time
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from subprocess import CompletedProcess
 from typing import Any
@@ -70,23 +71,15 @@ def run_all(commands: list[list[str]], **more: object) -> list[CompletedProcess]
         The results by rank; processes killed after ``LONGEST`` have the code -9.
     """
     known = {"WORLD_SIZE": len(commands), "MASTER_ADDR": "127.0.0.1", "MASTER_PORT": free_port()}
-    pipes: dict[str, Any] = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
-    started, ends = [], []
-    try:
-        for rank, command in enumerate(commands):
-            place = environment(RANK=rank, LOCAL_RANK=rank, **known, **more)
-            started.append(subprocess.Popen(command, env=place, **pipes))
-        limit = time.monotonic() + LONGEST
-        for process in started:
-            try:
-                out, err = process.communicate(timeout=max(0.1, limit - time.monotonic()))
-            except subprocess.TimeoutExpired:
-                process.kill()
-                out, err = process.communicate()
-            ends.append(CompletedProcess(process.args, process.returncode, out, err))
-    finally:
-        for process in started:
-            if process.poll() is None:
-                process.kill()
-                process.wait()
-    return ends
+
+    def run(rank: int) -> CompletedProcess:
+        place = environment(RANK=rank, LOCAL_RANK=rank, **known, **more)
+        pipes: dict[str, Any] = {"capture_output": True, "text": True, "timeout": LONGEST}
+        try:
+            return subprocess.run(commands[rank], env=place, **pipes)
+        except subprocess.TimeoutExpired as late:  # its outputs are bytes, or None
+            out, err = (bytes(x or b"").decode() for x in (late.stdout, late.stderr))
+            return CompletedProcess(commands[rank], -signal.SIGKILL, out, err)
+
+    with ThreadPoolExecutor(len(commands)) as threads:
+        return [*threads.map(run, range(len(commands)))]

@@ -39,9 +39,8 @@ def _three_rounds(monkeypatch):
 
 
 def variant(name="ours", run=lambda: None, error=1e-8, **options):
-    return measure.Variant(
-        name, run, lambda: Error(error, error, "out"), oracle="a loop", **options
-    )
+    found = Error(error, error, "out")
+    return measure.Variant(name, run, lambda: found, oracle="a loop", **options)
 
 
 def case(*variants, name="one", op="scan"):
@@ -66,12 +65,9 @@ def stub(monkeypatch, *cases):
 
 def test_records_have_the_schema_and_are_json():
     calls = []
-    document = run(
-        case(
-            variant(run=lambda: calls.append("ours"), work=lambda: {"pairs": 7}, default=True),
-            variant("slow", run=lambda: calls.append("slow"), peer=True, rounds=1),
-        )
-    )
+    own = variant(run=lambda: calls.append("ours"), work=lambda: {"pairs": 7}, default=True)
+    peer = variant("slow", run=lambda: calls.append("slow"), peer=True, rounds=1)
+    document = run(case(own, peer))
     assert json.loads(json.dumps(document, allow_nan=False)) == document
     ours, slow = document["records"]
     assert SCHEMA <= ours.keys() and SCHEMA <= slow.keys()
@@ -132,15 +128,11 @@ def raises(error):
 
 
 def test_what_raises_is_recorded_and_the_rest_goes_on():
-    document = run(
-        case(
-            variant("missing", raises(NotInstalled("mambapy")), peer=True),
-            variant("broken", raises(RuntimeError("no such\nkernel"))),
-            variant("fine"),
-        ),
-        Table("scan", "two", lambda settings: raises(MemoryError("too big"))()),
-        case(variant("last"), name="three"),
-    )
+    missing = variant("missing", raises(NotInstalled("mambapy")), peer=True)
+    broken = variant("broken", raises(RuntimeError("no such\nkernel")))
+    large = Table("scan", "two", lambda settings: raises(MemoryError("too big"))())
+    last = case(variant("last"), name="three")
+    document = run(case(missing, broken, variant("fine")), large, last)
     status = {r["variant"]: r["status"] for r in document["records"]}
     assert status == {
         "missing": "not installed: mambapy",
@@ -159,12 +151,8 @@ def test_interrupt_keeps_what_was_measured(monkeypatch, tmp_path, capsys):
         if count[0] == 4:  # first call, two rounds, then
             raise KeyboardInterrupt
 
-    cases = (
-        case(variant("a")),
-        case(variant("b", stop), variant("c"), name="two"),
-        case(variant("d")),
-    )
-    stub(monkeypatch, *cases)
+    second = case(variant("b", stop), variant("c"), name="two")
+    stub(monkeypatch, case(variant("a")), second, case(variant("d")))
     assert machine.bench_command(("scan",), quick=True, out=tmp_path) == 130
     assert "interrupted" in capsys.readouterr().out
     document = json.loads((tmp_path / "bench.json").read_text())
@@ -286,10 +274,7 @@ def test_cases_run(suite, name):
     if name == "skipping" and suite is raster:
         blocks = {(r["variant"], r["direction"]): r["work"]["blocks_traversed"] for r in records}
         for scene in ("few large", "many small"):
-            on, off = (
-                blocks[f"{scene}: {x} {y}", BOTH] for x, y in (("all", "on"), ("all", "off"))
-            )
-            assert on < off
+            assert blocks[f"{scene}: all on", BOTH] < blocks[f"{scene}: all off", BOTH]
     if name == "backbone":
         assert all(0 < r["rel_rms_error"] < 1e-7 for r in records)
     if name == "length":

@@ -64,12 +64,9 @@ def test_equal_terms_of_a_sum():
 def test_split_consistency(cut):
     inputs = make(2, 310, 19, 4)
     whole = causal_conv1d(**inputs, activation="silu")
-    parts, state = [], inputs.pop("initial_state")
-    x = inputs.pop("x")
+    parts, x, options = [], inputs["x"], {"activation": "silu", "return_final_state": True}
     for piece in (x[:, :cut], x[:, cut:]):
-        out, state = causal_conv1d(
-            piece, **inputs, initial_state=state, activation="silu", return_final_state=True
-        )
+        out, inputs["initial_state"] = causal_conv1d(**inputs | {"x": piece}, **options)
         parts.append(out)
     assert torch.equal(torch.cat(parts, 1), whole)
 
@@ -127,20 +124,12 @@ def test_strided_input():
 
 def test_causal_conv1d_signature():
     inputs = make(2, 21, 18, 4)
-    out, final = causal_conv1d_fn(
-        inputs["x"].transpose(1, 2),
-        inputs["weight"],
-        inputs["bias"],
-        initial_states=inputs["initial_state"].transpose(1, 2),
-        return_final_states=True,
-        activation="swish",
-    )
+    x, weight, bias, state = inputs.values()
+    options = {"initial_states": state.mT, "return_final_states": True, "activation": "swish"}
+    out, final = causal_conv1d_fn(x.mT, weight, bias, **options)
     want, want_final = causal_conv1d(**inputs, activation="silu", return_final_state=True)
-    assert torch.equal(out.transpose(1, 2), want) and torch.equal(final.transpose(1, 2), want_final)
-    assert torch.equal(
-        causal_conv1d_fn(inputs["x"].transpose(1, 2), inputs["weight"]),
-        causal_conv1d(inputs["x"], inputs["weight"]).transpose(1, 2),
-    )
+    assert torch.equal(out.mT, want) and torch.equal(final.mT, want_final)
+    assert torch.equal(causal_conv1d_fn(x.mT, weight), causal_conv1d(x, weight).mT)
 
 
 @pytest.mark.parametrize(
@@ -167,12 +156,8 @@ def test_bad_options():
     with pytest.raises(ValueError, match="activation must be one of .*got 'relu'"):
         causal_conv1d(**inputs, activation="relu")
     with pytest.raises(ValueError, match="seq_idx and states are given"):
-        causal_conv1d_fn(
-            inputs["x"].transpose(1, 2),
-            inputs["weight"],
-            seq_idx=torch.zeros(2, 5).int(),
-            return_final_states=True,
-        )
+        packed = {"seq_idx": torch.zeros(2, 5).int(), "return_final_states": True}
+        causal_conv1d_fn(inputs["x"].mT, inputs["weight"], **packed)
 
 
 def test_operator_contract():

@@ -110,9 +110,8 @@ def test_borders_that_nobody_looks_at_are_bounded(from_ptx):
     with patch.object(torch.compiler, "_is_compiling_flag", True):
         for cuts in ([0, 70, 70, 130, 130], [-3, 70, 20, 200, 130]):
             cuts = torch.tensor(cuts)
-            assert sequences(inputs["u"], cuts, None).tolist() == [
-                [0, 0, 70], [0, 70, 70], [0, 70, 130], [0, 130, 130]
-            ]  # fmt: skip
+            rows = sequences(inputs["u"], cuts, None).tolist()
+            assert rows == [[0, 0, 70], [0, 70, 70], [0, 70, 130], [0, 130, 130]]
             results.append([])
             for function, given in ((scan, inputs), (conv, tokens)):
                 x = leaves(given)
@@ -159,15 +158,14 @@ def test_no_tokens(lengths):
 def test_numbers_of_sequences():
     """``seq_idx`` of two rows says what ``cu_seqlens`` says of one; numbers may have gaps."""
     rows = [[4, 1, 70], [60, 15]]
-    seq_idx = torch.stack(
-        [3 * torch.arange(len(r)).repeat_interleave(torch.tensor(r)) for r in rows]
-    )
+    numbers = (torch.arange(len(r)).repeat_interleave(torch.tensor(r)) for r in rows)
+    seq_idx = 3 * torch.stack([*numbers]).int()
     cuts = borders([*rows[0], *rows[1]])
     x = make(2, 75, 6, 4) | {"initial_state": torch.randn(5, 6, 4)}
     y = {k: v for k, v in unpacked(2, 75, 6, 4).items() if k != "initial_state"}
     for function, inputs in ((scan, x), (lambda **x: [causal_conv1d(**x)], y)):
         flat = {k: v.flatten(0, 1)[None] if len(v) == 2 else v for k, v in inputs.items()}
-        outs = function(**inputs, seq_idx=seq_idx.int())
+        outs = function(**inputs, seq_idx=seq_idx)
         wants = function(**flat, cu_seqlens=cuts)
         assert torch.equal(outs[0].flatten(0, 1), wants[0][0])
         assert all(map(torch.equal, outs[1:], wants[1:]))

@@ -287,9 +287,8 @@ def test_the_compiler_and_meta_tensors():
     inputs = make(1, 2)
     given = 3, True, *(x.requires_grad_() for x in inputs.values())
     checks = ("test_schema", "test_faketensor", "test_autograd_registration")
-    torch.library.opcheck(
-        torch.ops.gamba_warp.rasterize_harmonics.default, given, test_utils=checks
-    )
+    operator = torch.ops.gamba_warp.rasterize_harmonics.default
+    torch.library.opcheck(operator, given, test_utils=checks)
     meta = colors_seen_from(3, *(x.to("meta") for x in inputs.values()))
     assert meta.shape == (1, 2, 37, 3) and meta.device.type == "meta"
 

@@ -48,9 +48,8 @@ def before_the_camera(scene, place, camera_points):
 def test_around_the_camera_plane(near):
     z = torch.tensor([-1, -1e-3, -1e-6, -1e-7, 0, 1e-7, 1e-6, 1e-3, 0.00999, 0.0101, 0.02])
     scene = base()
-    before_the_camera(
-        scene, torch.arange(11), torch.cat([0.003 * torch.randn(11, 2), z[:, None]], 1)
-    )
+    points = torch.cat([0.003 * torch.randn(11, 2), z[:, None]], 1)
+    before_the_camera(scene, torch.arange(11), points)
     _, alphas, _, meta = survives(scene, near_plane=near)
     assert alphas[0, 0].mean() > 0.1
     assert meta["culled"]["near"] >= 4

@@ -62,13 +62,9 @@ def test_lists_of_a_wide_image():
     sides = torch.tensor([3e5, 60.0]) * torch.rand(1, num, 2)  # of the box, at alpha_min
     opacities = 0.1 + 0.9 * torch.rand(1, num)
     a, e = (2 * (255 * opacities).log()[..., None] / sides**2).unbind(-1)
-    splats = Projected(
-        torch.rand(1, num, 2) * torch.tensor([width, height]),
-        torch.stack([a, torch.zeros(1, num), e], -1),
-        torch.rand(1, num),
-        opacities,
-        sides,
-    )
+    means2d = torch.rand(1, num, 2) * torch.tensor([width, height])
+    conics = torch.stack([a, torch.zeros(1, num), e], -1)
+    splats = Projected(means2d, conics, torch.rand(1, num), opacities, sides)
     grid = make_grid(Tiling(width, height), num=num, alpha_min=1 / 255, skip=TILE_TEST)
     want = bin_cpu.bin_views(grid, splats, lambda count: None)
     got = bin_cuda.bin_views(grid, splats, lambda count: None)

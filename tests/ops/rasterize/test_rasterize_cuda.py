@@ -240,9 +240,8 @@ def test_no_sub_tile_is_missed(from_ptx, longest):
     a, k, e = conics.double()[:, :, None, None].unbind(1)
     dy = centre[:, None] - means.double()[:, 1, None, None]
     u = centre - means.double()[:, 0, None, None] + k * dy
-    inside = (
-        opacities.double()[:, None, None] * (-0.5 * (a * u * u + e * dy * dy)).exp() >= ALPHA_MIN
-    )
+    falloff = (-0.5 * (a * u * u + e * dy * dy)).exp()
+    inside = opacities.double()[:, None, None] * falloff >= ALPHA_MIN
     needed = inside.view(count, 4, 4, 2, 8).any(4).any(2).view(count, 8)
     got = (bits[:, None] >> torch.arange(8) & 1).bool()
     assert not (needed & ~got).any()

@@ -10,6 +10,7 @@ import pytest
 import torch
 import warp as wp
 from helpers.children import ran
+from ops.runtime.test_team import Factors
 
 from gamba_warp.kernels.runtime import launch as launches
 from gamba_warp.kernels.runtime.launch import parallel_launch
@@ -19,14 +20,8 @@ wp.set_module_options({"enable_backward": False})
 CUDA = torch.device("cuda")
 
 
-@wp.struct
-class Two:
-    one: wp.float32
-    two: wp.int32
-
-
 @wp.kernel
-def _kernel(a_in: wp.array[wp.float32], two: Two, count: wp.int64, out: wp.array2d[wp.float32]):
+def _kernel(a_in: wp.array[wp.float32], two: Factors, count: wp.int64, out: wp.array2d[wp.float32]):
     i, j = wp.tid()
     out[i, j] = a_in[i] + two.one + float(two.two) + float(count)
 
@@ -40,8 +35,7 @@ class Recorded:
     def launch(self, stream):
         params = self.params
         if self.params_addr is not None:
-            kinds = [type(x) for x in params]
-            params = [kind.from_address(at) for kind, at in zip(kinds, self.params_addr)]
+            params = [type(x).from_address(at) for x, at in zip(params, self.params_addr)]
         copies = [type(x).from_buffer_copy(x) for x in params]
         self.handed.append((self.bounds, copies, stream))
 
@@ -62,7 +56,7 @@ def handed(monkeypatch):
 
 def call(a, count, dim):
     out = torch.empty(dim)
-    two = Two()
+    two = Factors()
     two.one, two.two = 0.5, count
     launches.cuda_launch(_kernel, dim, [a, two, count], [out], device=CUDA, block_dim=64)
     return out
@@ -98,9 +92,8 @@ def test_another_warp_launches_as_it_does(handed, monkeypatch, lacks):
 
     def other(*args, **kwargs):
         made = launch(*args, **kwargs)
-        whole = Recorded(made, handed)
+        made.launch = Recorded(made, handed).launch
         delattr(made, lacks)
-        made.launch = whole.launch
         return made
 
     monkeypatch.setattr(wp, "launch", other)

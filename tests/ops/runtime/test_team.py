@@ -1,6 +1,7 @@
 """CPU launches: on torch's threads, on Python's, and in a forked child, the same result."""
 
 import multiprocessing
+import sys
 import warnings
 
 import pytest
@@ -45,11 +46,13 @@ def mix(a, b, pieces=None):
     return out, want
 
 
-@pytest.mark.parametrize("with_team", [True, False])
+NO_TEAM = "torch has no OpenMP runtime with GNU's interface here"
+NEEDS_TEAM = pytest.mark.skipif(not has_team(), reason=NO_TEAM)
+
+
+@pytest.mark.parametrize("with_team", [pytest.param(True, marks=NEEDS_TEAM), False])
 @pytest.mark.parametrize("threads", [1, 2, 3])
 def test_every_place_once(monkeypatch, with_team, threads):
-    if with_team and not has_team():
-        pytest.skip("torch has no OpenMP runtime with GNU's interface here")
     if not with_team:
         monkeypatch.setattr(launches, "_parallel", 0)
     with on_threads(threads):
@@ -63,8 +66,6 @@ def test_team_is_found_on_linux():
     # torch's Linux wheels bring GNU's runtime; losing it unnoticed would cost speed, not results
     if "GNU" not in torch.__config__.parallel_info() and "OpenMP" not in torch.__config__.show():
         pytest.skip("torch without OpenMP")
-    import sys
-
     assert has_team() or sys.platform != "linux"
 
 
@@ -75,11 +76,10 @@ class _Other:
         self.__dict__ = {k: v for k, v in vars(command).items() if k != lacks}
 
 
+@NEEDS_TEAM
 @pytest.mark.parametrize("lacks", ["hooks", "params", "bounds", "module_exec"])
 def test_another_warp_has_no_team_and_says_so_once(monkeypatch, lacks):
     """The launches go to Python's threads, with the same results."""
-    if not has_team():
-        pytest.skip("torch has no OpenMP runtime with GNU's interface here")
     launch = wp.launch
 
     def other(*args, record_cmd=False, **kwargs):

@@ -78,9 +78,8 @@ def problem(kind, length, channels=16, states=2):
 
 
 def check(kind, length, threads):
-    gradient = (
-        2e-6 if kind in ("slow", "growing") else 1e-5
-    )  # measured below 1e-6; with f in float32 up to 4e-4
+    # measured below 1e-6; with f in float32 up to 4e-4
+    gradient = 2e-6 if kind in ("slow", "growing") else 1e-5
     with on_threads(threads):
         limits = 1e-6, gradient, 1e-6
         compare(problem(kind, length), *limits, exact=oracle, tiny=TINY, decays=ROUNDED)

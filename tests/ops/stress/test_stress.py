@@ -56,10 +56,7 @@ SMALL = {
 }
 
 
-@pytest.mark.parametrize(
-    ("name", "kind"),
-    [(name, kind) for name in OPS for kind in OPS[name].kinds],
-)
+@pytest.mark.parametrize("name, kind", [(name, kind) for name in OPS for kind in OPS[name].kinds])
 def test_every_kind_passes(name, kind):
     fixed = OPS[name].kinds[kind].items()
     fixed = {k: v[-1] if isinstance(v, tuple) else v for k, v in fixed}
