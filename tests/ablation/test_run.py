@@ -129,10 +129,7 @@ def test_a_stopped_ablation_resumes(gamba, tmp_path, number):
     (tmp_path / "calls").write_text("")
     words = [path, tmp_path / "data", "--out", tmp_path / "out", "--device", "cpu"]
     run = tmp_path / "out" / "rows" / "a" / "seed-0" / "run"
-    process = subprocess.Popen(
-        [python(), "-c", DRIVER, *FAKE, *map(str, words)],
-        env=os.environ | {"FAKE_CALLS": str(tmp_path / "calls")},
-    )
+    process = subprocess.Popen([python(), "-c", DRIVER, *FAKE, *map(str, words)])
     while not (run / "waits").exists():
         assert process.poll() is None
         time.sleep(0.05)

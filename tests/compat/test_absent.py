@@ -1,7 +1,6 @@
 """Missing names of other packages: importable, an error of one line on use, and documented."""
 
 import importlib
-import importlib.util
 import runpy
 import sys
 import types
@@ -119,8 +118,7 @@ def test_names_that_are_here_are_so_under_every_path():
 
 def test_nothing_of_gsplat_is_missing():
     """Public names of the package that is installed."""
-    if importlib.util.find_spec("gsplat") is None:
-        pytest.skip("needs the package gsplat (pip install gsplat==1.5.3)")
+    pytest.importorskip("gsplat", reason="needs the package gsplat (pip install gsplat==1.5.3)")
     for path in ("", "rendering", "utils", "cuda._wrapper", "distributed", "optimizers"):
         theirs = importlib.import_module(f"gsplat.{path}".rstrip("."))
         ours = importlib.import_module(f"{gsplat.__name__}.{path}".rstrip("."))

@@ -4,7 +4,6 @@ They run on the CPU; ``accumulate``, which blends given pairs of pixels and Gaus
 functions of nerfacc, written here.
 """
 
-import importlib.util
 import sys
 import types
 
@@ -16,9 +15,8 @@ from helpers.raster import leaves, make, mapped
 from gamba_warp.compat import gsplat as compat
 from gamba_warp.kernels.rasterize.constants import ALPHA_MIN, COMPENSATION_MIN
 
-if importlib.util.find_spec("gsplat") is None:
-    pytest.skip("needs the package gsplat (pip install gsplat==1.5.3)", allow_module_level=True)
-from gsplat.cuda import _torch_impl as gsplat
+NEEDED = "needs the package gsplat (pip install gsplat==1.5.3)"
+gsplat = pytest.importorskip("gsplat.cuda._torch_impl", reason=NEEDED)
 
 
 def alphas_of(means2d, conics, opacities, width, height):
@@ -96,8 +94,8 @@ KINDS = {
 }
 
 
-def scene_of(num=61, **changes):
-    scene = make(1, 2, num, **{"width": WIDTH, "height": HEIGHT, "size": 0.05, **changes})
+def scene_of(num=61):
+    scene = make(1, 2, num, width=WIDTH, height=HEIGHT, size=0.05)
     scene["opacities"] = 0.02 + 0.5 * torch.rand(1, num)  # gsplat's accumulate never stops
     del scene["backgrounds"]
     return scene

@@ -9,11 +9,12 @@ import numpy as np
 import trimesh
 from ablation.fake import write_plan
 from helpers.images import cut_out
+from helpers.micro import write_dataset
 from helpers.nodes.processes import words
 from helpers.released import make_released
 from helpers.views import cloud_of
 
-from gamba_warp.files import remove_folder, write_json
+from gamba_warp.files import remove_folder
 from gamba_warp.formats.ply import save_ply
 
 from .child import gamba
@@ -109,10 +110,7 @@ def make_world(folder: Path, commands: list[str]) -> None:
     solids = {"ball": trimesh.creation.icosphere(1), "box": trimesh.creation.box()}
     for name, mesh in (solids | {"cone": trimesh.creation.cone(1, 2)}).items():
         mesh.export(folder / "meshes" / f"{name}.ply")
-    data = "data render {world}/meshes --out {out} --views 4 --size 16 --workers 1"
-    undisturbed(*Job(data).words(folder, folder / "data"))
-    parts = {"version": 1, "train": ["ball", "box"], "val": ["cone"], "test": []}
-    write_json(folder / "data" / "split.json", parts)
+    write_dataset(folder / "data")
     undisturbed(*training(folder, folder / "run", 2))
     for name in ("a", "b"):
         cut_out(folder / "images" / f"{name}.png")

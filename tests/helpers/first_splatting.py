@@ -245,28 +245,25 @@ CASES = {
 }
 
 
-def compare(name: str) -> None:
-    """Fail unless images, gradients and radii of a case are the reference's."""
+def compare(name: str, layers=("inverse",)) -> None:
+    """Fail unless images, gradients and radii of a case are the reference's; also any layers."""
     case = CASES[name]
     settings = settings_of(**case.get("settings", {}))
     scene = scene_of(shs=case.get("shs"))
     if case.get("covars"):
         scene = with_covariances(scene, 1.0)
     leaves = {key: value.requires_grad_() for key, value in scene.items()}
-    color, radii, *inverse = draw(leaves, settings)
+    color, radii, *others = draw(leaves, settings)
     want, expected = draw_first(scene, settings)
     clear = ~want["close"]
-    assert clear.float().mean() > 0.97
+    assert clear.float().mean() > 0.97 and len(others) in (0, len(layers))
     assert color.shape == (3, HEIGHT, WIDTH) and radii.dtype == torch.int32
-    assert_rel_rms(color.detach()[:, clear], want["color"][:, clear], IMAGE, "colour")
-    v = torch.randn_like(color) * clear
-    outputs, cotangents = [(color, want["color"])], [v]
-    if inverse:
-        assert_rel_rms(inverse[0].detach()[:, clear], want["inverse"][:, clear], IMAGE, "inverse")
-        outputs.append((inverse[0], want["inverse"]))
-        cotangents.append(torch.randn(1, HEIGHT, WIDTH) * clear)
-    torch.autograd.backward([x for x, _ in outputs], cotangents)
-    torch.autograd.backward([x for _, x in outputs], [v.double() for v in cotangents])
+    found = {"color": color, **dict(zip(layers, others))}
+    for kind, image in found.items():
+        assert_rel_rms(image[:, clear], want[kind][:, clear], IMAGE, kind)
+    v = [torch.randn_like(image) * clear for image in found.values()]
+    torch.autograd.backward([*found.values()], v)
+    torch.autograd.backward([want[kind] for kind in found], [x.double() for x in v])
     for key in leaves:
         assert_rel_rms(leaves[key].grad, expected[key].grad, GRADIENT, key)
     # a radius may be rounded to the other side of an integer

@@ -172,10 +172,6 @@ class Cuts:
         self.views.append(distance)
         return blended, alpha
 
-    def distances(self, like):
-        """Distance of each pixel from its nearest cut, shaped as an image without channels."""
-        return torch.stack(self.views).view(like.shape[:-1])
-
 
 class Found(NamedTuple):
     """Results of the rasterizer, and of the oracle in float64.

@@ -151,20 +151,16 @@ def test_training_loads_without_what_makes_objects(monkeypatch):
         ("eval-views --checkpoint m --data d", "kornia", "eval"),
         ("demo", "kornia", "all"),
         ("app", "gradio", "app"),
-        ("reconstruct {0}/thing.png --out {0}/out --mesh obj", "trimesh", "mesh"),
-        ("reconstruct {0}/thing.png --out {0}/out --turntable mp4", "imageio_ffmpeg", "video"),
-        ("export {0}/thing.ply --out {0}/out --splats spz", "trimesh", "mesh"),  # a mesh by default
-        (
-            "export {0}/thing.ply --out {0}/out --mesh none --turntable mp4",
-            "imageio_ffmpeg",
-            "video",
-        ),
-        ("render {0}/thing.ply --out {0}/out --kind mp4", "imageio_ffmpeg", "video"),
+        ("reconstruct {0}/a.png --out {0}/out --mesh obj", "trimesh", "mesh"),
+        ("reconstruct {0}/a.png --out {0}/out --turntable mp4", "imageio_ffmpeg", "video"),
+        ("export {0}/a.ply --out {0}/out --splats spz", "trimesh", "mesh"),  # a mesh by default
+        ("export {0}/a.ply --out {0}/out --mesh none --turntable mp4", "imageio_ffmpeg", "video"),
+        ("render {0}/a.ply --out {0}/out --kind mp4", "imageio_ffmpeg", "video"),
     ],
 )
 def test_what_is_missing_is_one_line_before_any_work(line, library, extra, tmp_path):
-    cut_out(tmp_path / "thing.png")
-    save_ply(tmp_path / "thing.ply", some(10))
+    cut_out(tmp_path / "a.png")
+    save_ply(tmp_path / "a.ply", some(10))
     words = line.format(tmp_path).split()
     done = in_the_core(*words)
     name = "data render" if words[0] == "data" else words[0]

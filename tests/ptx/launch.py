@@ -4,7 +4,6 @@ import contextlib
 import ctypes
 import functools
 import itertools
-import json
 import math
 import re
 import zlib
@@ -13,13 +12,12 @@ from dataclasses import dataclass, field
 
 import numpy as np
 import torch
-import warp as wp
 from warp._src import context as warp_context
 
 from gamba_warp.kernels.runtime.views import StructValue
 
 from .contract import contracted
-from .machine import FAULTS, Array, Count, Finding, Launch, Missing, library
+from .machine import FAULTS, Array, Count, Finding, Launch, Missing, compiled, entry_of, library
 from .parse import Program, read
 from .simulated import simulated
 
@@ -38,17 +36,11 @@ def programs(module, block_dim: int, architecture: int = ARCHITECTURE) -> tuple[
         Missing: it cannot be kept.
         Refused: as ``read``.
     """
-    before = module.options["block_dim"]
-    module.options["block_dim"] = block_dim
     try:
-        (path,) = wp.compile_aot_module(module, arch=architecture, use_ptx=True)
-        text = path.read_text(errors="replace")
+        ((path, notes),) = compiled(module, block_dim, arch=architecture, use_ptx=True)
+        return read(path.read_text(errors="replace")), notes
     except OSError as error:
         raise Missing(f"the PTX of {module.name} cannot be kept: {error}") from error
-    finally:
-        module.options["block_dim"] = before
-    meta = path.with_name(f"{path.name.rsplit('.', 2)[0]}.meta")
-    return read(text), json.loads(meta.read_bytes())
 
 
 @dataclass
@@ -83,8 +75,7 @@ class Interpreter:
     def launch(self, kernel, dim, arguments, block_dim: int, device) -> None:
         """As ``launch_on_stream``."""
         of_module, notes = programs(kernel.module, block_dim)
-        pattern = re.compile(re.escape(kernel.key) + "_[0-9a-f]{8}_cuda_kernel_forward")
-        (name,) = filter(pattern.fullmatch, of_module)
+        name = entry_of(kernel, of_module)
         bounds = warp_context._build_launch_bounds_from_tuple(dim, kernel.adj.kernel_dim)
         packed = [
             warp_context.pack_arg(kernel, wanted.type, wanted.label, value, "cpu")

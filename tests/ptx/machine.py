@@ -4,6 +4,7 @@ import ctypes
 import functools
 import hashlib
 import importlib.util
+import json
 import os
 import re
 import shutil
@@ -52,6 +53,30 @@ def cuda_tool(name: str) -> Path | None:
     path = os.pathsep.join([os.environ.get("PATH", ""), *map(str, folders)])
     found = shutil.which(name, path=path)
     return Path(found) if found else None
+
+
+def compiled(module, block_dim: int, **options) -> list[tuple[Path, dict]]:
+    """Compile a Warp module ahead of time, for blocks of this many threads.
+
+    Returns:
+        Each binary, in Warp's folder of compiled kernels by the module's hash, and what Warp notes
+        of its entries.
+    """
+    before = module.options["block_dim"]
+    module.options["block_dim"] = block_dim
+    try:
+        paths = [*map(Path, wp.compile_aot_module(module, **options))]
+    finally:
+        module.options["block_dim"] = before
+    notes = (path.with_name(f"{path.name.rsplit('.', 2)[0]}.meta") for path in paths)
+    return [(path, json.loads(meta.read_bytes())) for path, meta in zip(paths, notes)]
+
+
+def entry_of(kernel, names) -> str:
+    """Return a kernel's entry; Warp adds a hash that depends on the target to its name."""
+    pattern = re.compile(re.escape(kernel.key) + "_[0-9a-f]{8}_cuda_kernel_forward")
+    (name,) = filter(pattern.fullmatch, names)
+    return name
 
 
 def _structure(name: str) -> type[ctypes.Structure]:

@@ -6,15 +6,11 @@ time, and the binaries hold their resources (``cubin.py``).
 
 from __future__ import annotations
 
-import json
-import re
 from collections.abc import Callable
 from functools import partial
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import torch
-import warp as wp
 from torch import Tensor
 
 from gamba_warp.kernels.causal_conv1d import causal_conv1d
@@ -24,6 +20,7 @@ from gamba_warp.kernels.selective_scan import selective_scan, selective_scan_sta
 
 from .cubin import RESERVED, Resources, read_cubin
 from .dry_run import Launch, launches_of
+from .machine import compiled, entry_of
 
 
 class Multiprocessor(NamedTuple):
@@ -175,19 +172,10 @@ def compile_kernel(launch: Launch) -> dict[int, tuple[Resources, int]]:
 
     What is in Warp's cache of compiled kernels is not compiled again.
     """
-    module = launch.kernel.module
-    before = module.options["block_dim"]
-    module.options["block_dim"] = launch.block
-    try:
-        paths = wp.compile_aot_module(module, arch=list(MACHINES), use_ptx=False)
-    finally:
-        module.options["block_dim"] = before
-    # Warp adds a hash that depends on the target to a kernel's name.
-    symbols = re.compile(re.escape(launch.kernel.key) + "_[0-9a-f]{8}_cuda_kernel_forward")
+    made = compiled(launch.kernel.module, launch.block, arch=list(MACHINES), use_ptx=False)
     found = {}
-    for architecture, path in zip(MACHINES, map(Path, paths)):
-        meta = json.loads((path.parent / f"{path.name.rsplit('.', 2)[0]}.meta").read_bytes())
+    for architecture, (path, notes) in zip(MACHINES, made):
         kernels = read_cubin(path.read_bytes())
-        (symbol,) = filter(symbols.fullmatch, kernels)
-        found[architecture] = kernels[symbol], meta.get(f"{symbol}_smem_bytes", 0)
+        symbol = entry_of(launch.kernel, kernels)
+        found[architecture] = kernels[symbol], notes.get(f"{symbol}_smem_bytes", 0)
     return found

@@ -36,8 +36,8 @@ def run(body, memory, threads=64, blocks=1, **options):
     return made
 
 
-# In these each thread writes what it reads of another's shared memory: of the next lane, or warp.
 STORE = "st.global.u32 [%rd4], %r1;"
+# In these each thread writes what it reads of another's shared memory: of the next lane, or warp.
 PUT, TAKE = "st.shared.u32 [%r4], %r1;", "ld.shared.u32 %r7, [%r6]; st.global.u32 [%rd4], %r7;"
 NEXT = f"xor.b32 %r5, %r2, 4; add.s32 %r6, %r3, %r5; {TAKE}"
 FAR = f"xor.b32 %r5, %r2, 128; add.s32 %r6, %r3, %r5; {TAKE}"
@@ -120,7 +120,7 @@ def test_without_a_compiler_or_room(monkeypatch, tmp_path):
     with pytest.raises(Missing, match="no NVRTC"):
         build()
     full = OSError(28, "No space left on device")
-    monkeypatch.setattr(launching.wp, "compile_aot_module", Mock(side_effect=full))
+    monkeypatch.setattr(machines.wp, "compile_aot_module", Mock(side_effect=full))
     with pytest.raises(Missing, match="cannot be kept: .*No space left"):
         launching.programs.__wrapped__(plain_kernel.module, 32)
 

@@ -14,7 +14,7 @@ from gamba_warp.kernels.runtime.views import view
 
 from .cubin import read_cubin
 from .dry_run import Launch, can_dry_run, dry_run
-from .machine import cuda_tool
+from .machine import compiled, cuda_tool
 from .resources import MACHINES, compile_kernel, find_kernels, resident_warps
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -196,9 +196,8 @@ def test_a_disassembler_counts_the_same(entries):
         pytest.skip("no nvdisasm")
     entry = next(e for e in entries if e.name == "scan_backward")
     used, _ = compile_kernel(entry.launch)[90]
-    module = entry.launch.kernel.module
-    module.options["block_dim"] = entry.launch.block
-    (path,) = wp.compile_aot_module(module, arch=90, use_ptx=False)
+    launch = entry.launch
+    ((path, _),) = compiled(launch.kernel.module, launch.block, arch=90, use_ptx=False)
     done = ran(tool, "-c", path)
     assert done.returncode == 0, done.stderr
     loads = re.findall(r"^\s+/\*[0-9a-f]{4,}\*/.*\bLDL\b.*", done.stdout, re.MULTILINE)

@@ -46,7 +46,7 @@ def run(function, degree, inputs, v=None, dtype=torch.float32):
 
 
 def both(degree, inputs, v=None):
-    """Those of the kernels and of the formula."""
+    """Results of ``run`` for the kernels and for the formula."""
     return (run(f, degree, inputs, v) for f in (colors_seen_from, colors_by_formula))
 
 

@@ -16,7 +16,7 @@ LISTS = ("pairs", "starts")
 
 
 def call(scene, **options):
-    """Renderings, gradients by name, and meta; the gradient of the lower half alone."""
+    """Results of ``drawn``, with the gradient of the lower half alone."""
 
     def without_upper(v):
         v[0][..., : v[0].shape[-3] // 2, :, :] = 0

@@ -38,7 +38,7 @@ COUNTS = ("pairs_traversed", "blocks_traversed", "blocks_used", "tiles_skipped")
 
 
 def run(scene, mode="RGB", **options):
-    """As ``drawn``, with those of meta's counts that depend on the kernels."""
+    """Results of ``drawn``, and those of meta's counts that depend on the kernels."""
     found, meta = drawn(scene, mode, **options)
     return found, {name: meta[name] for name in COUNTS}
 
@@ -60,7 +60,7 @@ def on_both(on_cuda, parts, scene, *mode, **options):
 
 
 def without_a_tile(v):
-    """No gradient in a tile, and in a sub-tile of another."""
+    """Remove the gradient of a tile, and of a sub-tile of another."""
     for x in v:
         x[:, :, :16, :16] = x[:, :, :4, 16:24] = 0
 

@@ -115,7 +115,7 @@ def test_one_gradient_alone(name):
 @pytest.mark.parametrize("kernels", [cpu, cuda])
 @pytest.mark.parametrize("name, absent", [("C", ()), ("A", ("C", "D", "z"))])
 def test_unneeded_gradients_are_not_computed(name, absent, kernels, from_ptx):
-    """Of the whole scan, and of the last state alone."""
+    """Gradients of the whole scan, and of the last state alone."""
     inputs = Inputs(**make(1, 10, 5, 2))._replace(**dict.fromkeys(absent))
     if kernels is cuda:
         from_ptx()

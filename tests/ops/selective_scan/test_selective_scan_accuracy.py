@@ -62,7 +62,7 @@ KINDS = {
 
 
 def turns(x, tokens):
-    """0 for so many tokens, then 1, and so on; shaped as ``u``."""
+    """Steps of 0 and 1, each of so many tokens; shaped as ``u``."""
     odd = torch.arange(x["u"].shape[1]) // tokens % 2
     return odd.float()[:, None].expand_as(x["u"]).contiguous()
 
