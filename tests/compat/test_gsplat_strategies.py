@@ -18,14 +18,14 @@ NEEDS_GSPLAT = pytest.mark.skipif(
     importlib.util.find_spec("gsplat") is None,
     reason="needs the package gsplat (pip install gsplat==1.5.3)",
 )
+BINOMS = torch.tensor([[math.comb(n, k) for k in range(51)] for n in range(51)]).float()
 
 
 def test_relocation():
     """Equation 9 in integer arithmetic, and a single Gaussian, which does not change."""
     opacities = torch.tensor([0.3, 0.9, 0.99, 0.005, 0.6])
     scales, ratios = torch.rand(5, 3) + 0.1, torch.tensor([1, 2, 51, 7, 99])
-    binoms = torch.tensor([[math.comb(n, k) for k in range(51)] for n in range(51)]).float()
-    new, sizes = compute_relocation(opacities, scales, ratios, binoms)
+    new, sizes = compute_relocation(opacities, scales, ratios, BINOMS)
     assert ratios.tolist() == [1, 2, 51, 7, 51]
     assert new[0] == pytest.approx(0.3) and torch.allclose(sizes[0], scales[0])
     for i, n in enumerate(ratios.tolist()):
@@ -43,13 +43,11 @@ def test_relocation():
 
 def test_relocation_to_a_smallest_opacity():
     """The scales follow from the opacity that is kept."""
-    opacities, scales = torch.tensor([0.1, 0.9]), torch.ones(2, 3)
-    binoms = torch.tensor([[math.comb(n, k) for k in range(9)] for n in range(9)]).float()
-    ratios = torch.tensor([8, 2])
-    new, sizes = compute_relocation(opacities, scales, ratios, binoms, min_opacity=0.05)
+    opacities, scales, ratios = torch.tensor([0.1, 0.9]), torch.ones(2, 3), torch.tensor([8, 2])
+    new, sizes = compute_relocation(opacities, scales, ratios, BINOMS, min_opacity=0.05)
     assert new[0] == pytest.approx(0.05) and new[1] == pytest.approx(1 - 0.1**0.5)
     free = 1 - 0.95**8  # has the new opacity without a bound
-    want = compute_relocation(torch.tensor([free, 0.9]), scales, ratios, binoms)
+    want = compute_relocation(torch.tensor([free, 0.9]), scales, ratios, BINOMS)
     assert torch.allclose(sizes[0], want[1][0] * 0.1 / free) and torch.equal(sizes[1], want[1][1])
 
 

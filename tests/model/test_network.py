@@ -22,14 +22,7 @@ SMALL |= {"encoder": "none", "position_bins": 5}
 OPTIONS = [
     {"image_size": 4, "patch_size": 4, "norm": "rms", "expand": 1, "conv_size": 2, "dt_rank": 1},
     {"predict_rotation": True, "discretization": "bilinear", "conv_size": 3, "state_size": 16},
-    {
-        "camera_token": False,
-        "prepend": False,
-        "discretization": "zoh",
-        "depth": 3,
-        "position_bins": 21,
-        "width": 20,
-    },
+    {"prepend": False, "discretization": "zoh", "depth": 3, "position_bins": 21, "width": 20},
     {"additive_image_tokens": False, "patch_size": 1, "image_size": 3, "state_size": 1, "width": 4},
 ]
 # Additions to parameters whose names end so.
@@ -60,7 +53,7 @@ def in_float64(model, w, cameras):
         kernel = w["tokens.patchify.weight"], w["tokens.patchify.bias"], config.patch_size
         x = F.conv2d(pixels, *kernel).flatten(2).mT[:, model.tokens.orders] + x
     prefix = {"image": w["image_tokens"]}
-    if config.camera_token:
+    if model.camera_token:
         hidden = F.silu(linear(w, "camera_token.mlp.0", camera_numbers(cameras).double()))
         prefix["camera"] = linear(w, "camera_token.mlp.2", hidden)[:, None]
     for i in range(config.depth):
@@ -93,7 +86,7 @@ def change(model, kind):
 def test_the_network_and_its_gradients_are_those_of_float64(kind, changes):
     config = GambaConfig(**SMALL | changes)
     model = perturbed(Gamba(config))
-    camera = config.width if config.camera_token else 0
+    camera = config.width if model.camera_token else 0
     model.blocks = moved_blocks(config, camera, IMAGE_CHANNELS)
     change(model, kind)
     images, cameras = inputs(3, config.image_size)
