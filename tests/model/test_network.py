@@ -31,6 +31,7 @@ ADDED = {
     "short steps": {"dt_proj.bias": -25.0},
     "slow decay": {"A_log": -14.0},
     "fast decay": {"A_log": 7.0},
+    "large scales": {"decoder.scale.bias": 8.0},
 }
 SCALED_IMAGES = {"black": 0.0, "out of range": 1e3}
 # Of results and of gradients, by kind: measured 4e-7 and 3e-6, of saturated heads 1e-6 and 8e-6,
