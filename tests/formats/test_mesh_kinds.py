@@ -5,7 +5,7 @@ import struct
 import numpy as np
 import pytest
 import trimesh
-from helpers.meshes import CORNERS, FACET, MTL, QUAD, XYZ, ply_head, write_quad
+from helpers.meshes import CORNERS, FACET, MTL, QUAD, QUARTERS, XYZ, ply_head, write_quad
 from helpers.refusals import refused
 from PIL import Image
 
@@ -21,6 +21,7 @@ V = "v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\n"
 FOUR = ["0 0 0", "1 0 0", "1 1 0", "0 1 0"]
 # A comb of three teeth, counter-clockwise; area 8.
 COMB = np.reshape([*map(int, "005052424131322221111202")], (-1, 2))
+FLAT_COMB = np.pad(COMB.astype(float), ((0, 0), (0, 1)))
 # Turned, so that no axis is across it.
 TURN = np.linalg.qr(np.random.default_rng(1).normal(size=(3, 3)))[0]
 
@@ -42,7 +43,7 @@ def areas(points, faces):
 
 def ply(rows, faces, colours="", face_colours="", head="", kind="uchar"):
     of_rows, of_faces = (
-        [f"{kind} {name}" for name in names.split()] for names in (colours, face_colours)
+        [f"{kind} {n}" for n in names.split()] for names in (colours, face_colours)
     )
     text = ply_head(vertex=(len(rows), *XYZ, *of_rows), face=(len(faces), CORNERS, *of_faces))
     text = text.replace("element vertex", f"{head}element vertex")
@@ -56,8 +57,7 @@ def cut(points, polygons):
 
 
 def test_concave_polygons_keep_their_area():
-    flat = np.array(COMB, float)
-    for points in (np.pad(flat, ((0, 0), (0, 1))) @ TURN.T, 1e6 + np.pad(flat, ((0, 0), (1, 0)))):
+    for points in (FLAT_COMB @ TURN.T, 1e6 + FLAT_COMB[:, [2, 0, 1]]):
         for order in (np.arange(12), np.arange(12)[::-1], np.roll(np.arange(12), 5)):
             found = areas(points, cut(points, [order]))
             sizes = np.linalg.norm(found, axis=1)
@@ -68,7 +68,7 @@ def test_concave_polygons_keep_their_area():
 def test_many_polygons_of_all_kinds_in_their_order():
     """Convex ones become fans; the triangles keep the order of the polygons."""
     arrow = np.array([[0, 0, 0], [2, 1, 0], [0, 2, 0], [1, 1, 0]], float)
-    points = np.concatenate([arrow, arrow + [5, 0, 0], np.pad(COMB, ((0, 0), (0, 1))) + [20, 0, 0]])
+    points = np.concatenate([arrow, arrow + [5, 0, 0], FLAT_COMB + [20, 0, 0]])
     polygons = [[4, 5, 6], [0, 1, 2, 3], [5, 6], [*range(8, 20)], [4, 5, 6, 7], [0, 1, 2], [1]]
     found = cut(points, polygons)
     assert found[[0, -1]].tolist() == [[4, 5, 6], [0, 1, 2]]
@@ -88,22 +88,19 @@ def test_polygons_without_area_or_that_intersect_themselves_are_cut_somehow():
 
 def test_too_many_concave_corners_are_named(monkeypatch):
     monkeypatch.setattr("gamba_warp.formats.parts.MAX_WORK", 4000)
-    sides, points = SideFiles("a.obj"), np.pad(np.array(COMB, float), ((0, 0), (0, 1)))
-    corners, lengths = np.tile(np.arange(12), 3), np.full(3, 12)
-    assert cut_polygons(sides, points, corners, lengths).shape == (30, 3)
-    assert sides.warnings == [
-        "too many concave polygons: some are triangulated as if they were convex"
-    ]
+    sides, corners, lengths = SideFiles("a.obj"), np.tile(np.arange(12), 3), np.full(3, 12)
+    assert cut_polygons(sides, FLAT_COMB, corners, lengths).shape == (30, 3)
+    (warning,) = sides.warnings
+    assert warning == "too many concave polygons: some are triangulated as if they were convex"
 
 
 @pytest.mark.parametrize("suffix", ["obj", "off", "ply"])
 def test_concave_polygons_of_files(tmp_path, suffix):
-    rows = [f"{x} {y} 0" for x, y in COMB]
-    corners = [*range(12)]
+    rows, face = [f"{x} {y} 0" for x, y in COMB], f"12 {' '.join(map(str, range(12)))}"
     text = {
-        "obj": "".join(f"v {row}\n" for row in rows) + f"f {' '.join(str(c + 1) for c in corners)}",
-        "off": "OFF\n12 1 0\n" + "\n".join([*rows, "12 " + " ".join(map(str, corners))]),
-        "ply": ply(rows, ["12 " + " ".join(map(str, corners))]),
+        "obj": "".join(f"v {row}\n" for row in rows) + f"f {' '.join(map(str, range(1, 13)))}",
+        "off": "\n".join(["OFF", "12 1 0", *rows, face]),
+        "ply": ply(rows, [face]),
     }[suffix]
     mesh = loaded(tmp_path, f"a.{suffix}", text)
     assert (areas(mesh.vertices, mesh.faces)[:, 2] > 0).all()
@@ -124,11 +121,8 @@ def test_vertices_of_no_visible_face_are_left_out(tmp_path, suffix):
     assert mesh.flat == 2 and len(mesh.faces) == len(mesh.uvs) == len(mesh.normals) == 2
     assert len(mesh.vertices) == 4 and places(mesh).max((0, 1)).tolist() == [1, 1, 0]
     assert mesh.normalized("z")[2] == 1
-    flat = loaded(
-        tmp_path,
-        f"b.{suffix}",
-        text.replace(*{"obj": ("f 2 3 4 5\n", "")}.get(suffix, ("4 1 2 3 4", "3 0 1 6"))),
-    )
+    text = text.replace(*{"obj": ("f 2 3 4 5\n", "")}.get(suffix, ("4 1 2 3 4", "3 0 1 6")))
+    flat = loaded(tmp_path, f"b.{suffix}", text)
     assert flat.warnings[-1:] == ["no face has an area"] and flat.normalized("z")[2] == 1 / 9
 
 
@@ -172,9 +166,7 @@ def test_invalid_lines_of_obj(tmp_path, line):
     refused("line 5, ", loaded, tmp_path, "a.obj", V + line + "\nf 1 2 3\n")
 
 
-MIXED = (
-    V
-    + """vt 0 0
+MIXED = f"""{V}vt 0 0
 vn 0 0 1
 usemtl a
 f -1/1/1 -2//1 -3
@@ -185,7 +177,6 @@ f 1 2 5 4
 l 1 2
 f -1 -2 -3
 """
-)
 
 
 @pytest.mark.parametrize("block", [30, 60, 1 << 24])
@@ -284,9 +275,7 @@ def test_numbers_of_obj_as_some_programs_write_them(tmp_path):
 def test_comments_and_other_colours_of_mtl(tmp_path):
     """Comments behind names, colours up to 255, a texture of the ambient light alone, TARGA."""
     mtl = "newmtl paint # the wood\nKd 255 0 51 # red\n"
-    obj = QUAD.replace("usemtl paint", "usemtl paint # here").replace(
-        "quad.mtl", "quad.mtl # colours"
-    )
+    obj = QUAD.replace("paint", "paint # here").replace("quad.mtl", "quad.mtl # colours")
     assert obj.count(" # ") == 2
     mesh = load_mesh(write_quad(tmp_path, obj=obj, mtl=mtl, texture=None))
     np.testing.assert_allclose(mesh.materials[0].color[:3], to_linear([1, 0, 0.2]))
@@ -298,9 +287,7 @@ def test_comments_and_other_colours_of_mtl(tmp_path):
 
 
 def test_a_text_stl_without_its_last_line(tmp_path):
-    rows = ["solid", "facet normal 0 0 1", "outer loop", "vertex 0 0 0", "vertex 1 0 0"]
-    rows += ["vertex 0 1 0", "endloop", "endfacet"]
-    mesh = loaded(tmp_path, "a.stl", "\n".join("  " + row for row in rows))
+    mesh = loaded(tmp_path, "a.stl", f"solid\n{FACET}")
     assert len(mesh.faces) == 1
     assert mesh.omitted == ["there is no endsolid: the end of the file may be missing"]
 
@@ -308,10 +295,8 @@ def test_a_text_stl_without_its_last_line(tmp_path):
 @pytest.mark.parametrize("head", ["OFF4 1 0", "OFF 4 1 0", "OFF\n4 1 0", "\ufeffOFF\r\n\r\n4 1"])
 def test_headers_of_off(tmp_path, head):
     mesh = loaded(tmp_path, "a.off", "\n".join([head, *FOUR, "4 0 1 2 3"]))
-    assert places(mesh).tolist() == [
-        [[0, 0, 0], [1, 0, 0], [1, 1, 0]],
-        [[0, 0, 0], [1, 1, 0], [0, 1, 0]],
-    ]
+    square = [0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]
+    assert places(mesh).tolist() == [[*square[:3]], [square[0], *square[2:]]]
     for wrong in ("OFFA\n4 1 0", "4OFF\n4 1 0", "nOFF\n4 1 0", "OFF4"):
         refused("broken header", loaded, tmp_path, "a.off", "\n".join([wrong, *FOUR, "3 0 1 2"]))
 
@@ -365,9 +350,8 @@ def test_bytes_of_stl(tmp_path):
         assert places(mesh).tolist() == [[[0, 0, 0], [1, 0, 0], [0, 1, 0]]]
         mesh = loaded(tmp_path, "a.stl", data + b"written by somebody")
         assert "19 bytes behind the faces are left out" in mesh.warnings and len(mesh.faces) == 1
-    refused(
-        "take 100 bytes but 50 follow", loaded, tmp_path, "a.stl", data[:80] + b"\2\0\0\0" + row
-    )
+    short = data[:80] + b"\2\0\0\0" + row
+    refused("take 100 bytes but 50 follow", loaded, tmp_path, "a.stl", short)
     painted = row[:-2] + struct.pack("<H", 0x8000 | 31)
     mesh = loaded(tmp_path, "a.stl", b"".ljust(80) + struct.pack("<I", 1) + painted)
     assert "the colours of an .stl file are not read" in mesh.warnings
@@ -396,16 +380,14 @@ def test_a_ply_of_one_face(tmp_path):
 
 
 def test_further_elements_of_ply_are_named(tmp_path):
-    text = ply(FOUR, ["4 0 1 2 3"]).replace(
-        "end_header", "element edge 1\nproperty int a\nend_header"
-    )
+    edge = "element edge 1\nproperty int a\nend_header"
+    text = ply(FOUR, ["4 0 1 2 3"]).replace("end_header", edge)
     assert "the element edge is not read" in loaded(tmp_path, "a.ply", text + "7\n").warnings
 
 
 def test_textures_of_ply(tmp_path):
     """As MeshLab and scanners write them: for each corner, or for each vertex."""
-    pixels = np.array([[[255, 0, 0], [0, 255, 0]], [[0, 0, 255], [255, 255, 0]]], np.uint8)
-    Image.fromarray(pixels).save(tmp_path / "a b.png")
+    Image.fromarray(QUARTERS).save(tmp_path / "a b.png")
     head = "comment TextureFile a b.png\n"
     text = ply(FOUR, ["4 0 1 2 3 8 0 0 1 0 1 1 0 1"], head=head)
     text = text.replace("end_header", "property list uchar float texcoord\nend_header")
@@ -415,7 +397,7 @@ def test_textures_of_ply(tmp_path):
     for mesh in (corners, vertices):
         assert not mesh.warnings
         np.testing.assert_array_equal(mesh.uvs, places(mesh)[..., :2])
-        assert mesh.materials[0].texture[..., :3].tolist() == pixels.tolist()
+        assert mesh.materials[0].texture[..., :3].tolist() == QUARTERS.tolist()
 
 
 @pytest.mark.parametrize("kind", ["glb", "obj", "ply"])

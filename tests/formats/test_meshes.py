@@ -36,8 +36,7 @@ def test_normalized(tmp_path):
     points = np.hstack([before.vertices, np.ones((4, 1))])
     np.testing.assert_allclose(scale * points @ transform.T, mesh.vertices, atol=1e-12)
     np.testing.assert_allclose(np.abs(mesh.normals[..., 1]), 1)
-    kept, _, _ = before.normalized("z")
-    np.testing.assert_allclose(kept.vertices.max(0), [0.5, 0.5, 0])
+    np.testing.assert_allclose(before.normalized("z")[0].vertices.max(0), [0.5, 0.5, 0])
     # x to y, y to z, z to x; then y-up to z-up
     turned, _, _ = before.normalized("y", [[0, 0, 1], [1, 0, 0], [0, 1, 0]])
     np.testing.assert_allclose(turned.vertices.max(0), [0, 0.5, 0.5], atol=1e-12)
@@ -123,18 +122,14 @@ def test_a_texture_coordinate_of_one_number_has_v_0(tmp_path, old):
 
 
 def test_transparency_of_mtl(tmp_path):
-    path = write_quad(tmp_path, mtl="newmtl paint\nKd 0.5 1 0\nd 0.25\n")
-    np.testing.assert_allclose(load_mesh(path).materials[0].color[3], 0.25)
-    path = write_quad(tmp_path, mtl="newmtl paint\nKd 0.5 1 0\nTr 0.25\n")
-    material = load_mesh(path).materials[0]
-    np.testing.assert_allclose(material.color[3], 0.75)
-    # 0.5 is rounded to 8 bits on the way
-    np.testing.assert_allclose(material.color[:3], to_linear([128 / 255, 1, 0]), atol=0.01)
-    Image.fromarray(np.full((4, 4), 64, np.uint8)).save(tmp_path / "mask.png")
+    for line, alpha in (("d 0.25", 0.25), ("Tr 0.25", 0.75)):
+        path = write_quad(tmp_path, mtl=f"newmtl paint\nKd 0.5 1 0\n{line}\n")
+        want = [*to_linear([0.5, 1, 0]), alpha]
+        np.testing.assert_allclose(load_mesh(path).materials[0].color, want, rtol=1e-6)
     path = write_quad(tmp_path, mtl=MTL + "map_d mask.png\n")
-    assert (load_mesh(path).materials[0].texture[..., 3] == 64).all()
-    Image.fromarray(np.full((4, 4), 64 * 257, np.uint16)).save(tmp_path / "mask.png")
-    assert (load_mesh(path).materials[0].texture[..., 3] == 64).all()
+    for value in (np.uint8(64), np.uint16(64 * 257)):
+        Image.fromarray(np.full((4, 4), value)).save(tmp_path / "mask.png")
+        assert (load_mesh(path).materials[0].texture[..., 3] == 64).all()
 
 
 def test_colour_profiles_of_textures(tmp_path):
@@ -151,8 +146,7 @@ def test_colour_profiles_of_textures(tmp_path):
     box.visual = trimesh.visual.TextureVisuals(uv=np.zeros((8, 2)), image=image)
     box.export(tmp_path / "a.glb")
     assert b"iCCP" in (tmp_path / "a.glb").read_bytes()
-    glb = load_mesh(tmp_path / "a.glb")
-    np.testing.assert_array_equal(glb.materials[0].texture, before)
+    np.testing.assert_array_equal(load_mesh(tmp_path / "a.glb").materials[0].texture, before)
     image.save(tmp_path / "paint.png", icc_profile=b"none")
     assert "paint.png: its colour profile is not used" in load_mesh(path).warnings[0]
 
@@ -175,8 +169,7 @@ def test_other_formats(tmp_path):
 def test_smooth_normals_are_kept(tmp_path):
     trimesh.creation.icosphere(subdivisions=3).export(tmp_path / "ball.ply")
     mesh = load_mesh(tmp_path / "ball.ply")
-    outward = mesh.vertices[mesh.faces]
-    assert ((mesh.normals * outward).sum(-1) > 0.999).all()
+    assert ((mesh.normals * mesh.vertices[mesh.faces]).sum(-1) > 0.999).all()
 
 
 def test_display_curve_inverts():
