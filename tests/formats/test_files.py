@@ -5,6 +5,7 @@ import hashlib
 import os
 import time
 import tracemalloc
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -67,13 +68,14 @@ def test_leftovers_are_swept_by_age_and_nothing_else_is(tmp_path):
         return name
 
     put(f"{PART}abcd1234", 1.1)
-    kept = [put(f"{PART}abcd1235", 0.9), put(f"{PART}abcd12345", 3), put(f"x{PART}abcd1234", 3)]
-    kept += [put(".config.settings", 3), put("results", 3)]
-    (tmp_path / f"{PART}linklink").symlink_to(tmp_path / "results")
+    young, link = put(f"{PART}abcd1235", 0.9), f"{PART}linklink"
+    others = (f"{PART}abcd12345", f"x{PART}abcd1234", ".config.settings", "results")
+    kept = {link, *(put(name, 3) for name in others)}
+    (tmp_path / link).symlink_to(tmp_path / "results")
     output_folder(tmp_path)
-    assert sorted(os.listdir(tmp_path)) == sorted([*kept, f"{PART}linklink"])
+    assert {*os.listdir(tmp_path)} == {*kept, young}
     sweep(tmp_path, age=0)
-    assert sorted(os.listdir(tmp_path)) == sorted([*kept[1:], f"{PART}linklink"])
+    assert {*os.listdir(tmp_path)} == kept
     assert os.listdir(tmp_path / "results") == ["a.ply"]
 
 
@@ -125,15 +127,9 @@ def test_what_has_its_name_is_on_the_disk(tmp_path, monkeypatch):
     parts = {part.stat().st_ino for part in (folder, folder / "deep", folder / "deep" / "c.txt")}
     assert set(done[1:-2]) == parts and done[-2:] == ["b", tmp_path.stat().st_ino]
 
-    def refuse(number):
-        def sync(handle):
-            raise OSError(number, os.strerror(number))
-
-        monkeypatch.setattr(os, "fsync", sync)
-
-    refuse(errno.EINVAL)  # of a drive that cannot sync
-    write_text(path, "b")
-    refuse(errno.EIO)
+    monkeypatch.setattr(os, "fsync", Mock(side_effect=OSError(errno.EINVAL, "no sync")))
+    write_text(path, "b")  # to a drive that cannot sync
+    monkeypatch.setattr(os, "fsync", Mock(side_effect=OSError(errno.EIO, "Input/output error")))
     refused("a.txt: Input/output error", write_text, path, "c")
     assert path.read_text() == "b"
 

@@ -54,11 +54,11 @@ class Document:
 
     def sparse(self, at, values):
         """Return changes of an accessor: ``values`` at the indices ``at``."""
-        indices, values = np.array(at, "u1"), np.array(values, "<f4")
+        kind = _KINDS[at.dtype.str[1:]]
         return {
-            "count": len(indices),
-            "indices": {"bufferView": self.view(indices.tobytes()), "componentType": 5121},
-            "values": {"bufferView": self.view(values.tobytes())},
+            "count": len(at),
+            "indices": {"bufferView": self.view(at.tobytes()), "componentType": kind},
+            "values": {"bufferView": self.view(np.array(values, "<f4").tobytes())},
         }
 
     def paint(self, info=(), texture=(), base=(), **material):
@@ -405,7 +405,7 @@ def test_weights_of_a_skin(tmp_path):
 @pytest.mark.parametrize("at, valid", [(3, True), (4, False)])
 def test_the_last_sparse_index(tmp_path, at, valid):
     document = Document()
-    sparse = document.sparse([at], [0, 1, 5])
+    sparse = document.sparse(np.array([at], "u1"), [0, 1, 5])
     document.attributes["POSITION"] = document.array(SQUARE, sparse=sparse)
     if valid:
         assert places(document.load(tmp_path))[1, 2].tolist() == [0, 1, 5]
@@ -415,7 +415,7 @@ def test_the_last_sparse_index(tmp_path, at, valid):
 
 def test_morph_targets_and_sparse_values(tmp_path):
     document = Document()
-    sparse = document.sparse([2], [0, 0, 5])
+    sparse = document.sparse(np.array([2], "<u2"), [0, 0, 5])
     accessor = {"componentType": 5126, "type": "VEC3", "count": 4, "sparse": sparse}
     document.tree["accessors"].append(accessor)
     document.primitive["targets"] = [{"POSITION": len(document.tree["accessors"]) - 1}]

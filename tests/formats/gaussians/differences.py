@@ -20,9 +20,8 @@ def differences(want, got):
     order = distance.argmin(1)
     assert got.num == want.num and len(set(order.tolist())) == want.num
     got = got.select(order)
-    cosines = (
-        (rotations(want.quats.double()) * rotations(got.quats.double())).sum(1).abs().clamp(max=1)
-    )
+    axes, others = (rotations(each.quats.double()) for each in (want, got))
+    cosines = (axes * others).sum(1).abs().clamp(max=1)
     found = {
         "means": distance.min(1).values.max(),
         "angle": cosines.arccos().max(),
@@ -38,18 +37,9 @@ def differences(want, got):
 # Tolerances of the formats: half a step of their numbers, for the Gaussians of
 # ``helpers.gaussians.some`` in a unit cube. Angles: three numbers, each half a step off.
 ALLOWED = {
-    "ply": {
-        **{"means": 0, "angle": 1e-3, "logs": 1e-6, "opacities": 1e-6},
-        **{"colors": 1e-6, "harmonics": 0},
-    },
+    "ply": dict(means=0, angle=1e-3, logs=1e-6, opacities=1e-6, colors=1e-6, harmonics=0),
     # 8 bits: 1/128 of a number of the quaternion, which is twice that as an angle
-    "splat": {
-        "means": 0,
-        "angle": 0.04,
-        "logs": 1e-6,
-        "opacities": 0.501 / 255,
-        "colors": 0.501 / 255,
-    },
+    "splat": dict(means=0, angle=0.04, logs=1e-6, opacities=0.501 / 255, colors=0.501 / 255),
     # positions 16 bits behind the point; logarithms 1/16; colours 1/255 of C0/0.15
     "spz": {
         **{"means": 0.9 / 2**16, "angle": 4e-3, "logs": 0.501 / 16, "opacities": 0.501 / 255},

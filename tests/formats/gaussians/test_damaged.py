@@ -69,56 +69,47 @@ def test_empty_missing_and_a_folder(tmp_path, kind):
     refused(path)
 
 
-@pytest.mark.parametrize("wrong", [299, 301, 10_000_000, 2**32 - 1])
-def test_an_spz_with_a_false_count(sound, wrong):
+@pytest.fixture
+def spz(sound):
+    """The path of an .spz, and what it holds."""
     path, data = sound("spz")
-    inner = bytearray(gzip.decompress(data))
-    struct.pack_into("<I", inner, 8, wrong)
-    path.write_bytes(gzip.compress(bytes(inner)))
-    tracemalloc.start()
-    refused(path)
-    assert tracemalloc.get_traced_memory()[1] < 5e6  # nothing was made room for
-    tracemalloc.stop()
+    return path, bytearray(gzip.decompress(data))
 
 
 @pytest.mark.parametrize(
     "at, value, word",
-    [(4, 4, "version 4"), (4, 0, "version 0"), (12, 4, "degree 4"), (12, 0, "more data follows")],
+    [
+        *((8, struct.pack("<I", count), "") for count in (299, 301, 10_000_000, 2**32 - 1)),
+        *((4, b"\4", "version 4"), (4, b"\0", "version 0")),
+        *((12, b"\4", "degree 4"), (12, b"\0", "more data follows")),
+        (1 << 20, bytes(1 << 26), "more data follows"),  # behind the end: a bomb
+    ],
 )
-def test_an_spz_with_a_false_header(sound, at, value, word):
-    path, data = sound("spz")
-    inner = bytearray(gzip.decompress(data))
-    inner[at] = value
-    path.write_bytes(gzip.compress(bytes(inner)))
-    refused(path, word)
-
-
-def test_an_spz_bomb_and_a_damaged_stream(sound):
-    path, data = sound("spz")
-    path.write_bytes(gzip.compress(gzip.decompress(data) + bytes(1 << 26), 9))
+def test_an_spz_with_a_false_header(spz, at, value, word):
+    path, inner = spz
+    inner[at : at + len(value)] = value
+    path.write_bytes(gzip.compress(inner, 9))
     tracemalloc.start()
-    refused(path, "more data follows")
-    assert tracemalloc.get_traced_memory()[1] < 5e6
+    refused(path, word)
+    assert tracemalloc.get_traced_memory()[1] < 5e6  # nothing was made room for
     tracemalloc.stop()
+
+
+def test_an_spz_with_a_damaged_stream(sound):
+    path, data = sound("spz")
     path.write_bytes(data[:-8] + b"\0\0\0\0" + data[-4:])
     refused(path, "damaged")
 
 
-def test_an_spz_of_two_members_is_read(sound):
+def test_an_spz_of_two_members_or_with_extensions_is_read(spz):
     """gzip files may be joined."""
-    path, data = sound("spz")
-    want, inner = read_gaussians(path), gzip.decompress(data)
-    path.write_bytes(gzip.compress(inner[:30]) + gzip.compress(inner[30:]))
-    assert torch.equal(read_gaussians(path).means, want.means)
-
-
-def test_an_spz_with_extensions_is_read(sound, tmp_path):
-    path, data = sound("spz")
+    path, inner = spz
     want = read_gaussians(path)
-    inner = bytearray(gzip.decompress(data))
+    two = gzip.compress(inner[:30]) + gzip.compress(inner[30:])
     inner[14] |= 2
-    path.write_bytes(gzip.compress(bytes(inner) + b"an extension"))
-    torch.testing.assert_close(read_gaussians(path).means, want.means)
+    for content in (two, gzip.compress(inner + b"an extension")):
+        path.write_bytes(content)
+        assert torch.equal(read_gaussians(path).means, want.means)
 
 
 @pytest.mark.parametrize(
@@ -140,21 +131,18 @@ def test_an_invalid_compressed_ply(sound, old, new, word):
 
 
 @pytest.mark.parametrize(
-    "bound, value, reason",
+    "bound, value, bad",
     [
-        (BOUNDS[0], float("nan"), "not finite"),
-        # the sizes of 256 Gaussians between -inf and a logarithm are unknown
-        *(
-            (f"{end}_scale_x", -np.inf, "256 of 300 Gaussians have scales that are not finite")
-            for end in ("min", "max")
-        ),
+        ("min_x", np.nan, "means"),
+        *((f"{end}_scale_x", -np.inf, "scales") for end in ("min", "max")),
     ],
 )
-def test_a_compressed_ply_with_bounds_that_are_not_finite(sound, bound, value, reason):
+def test_a_compressed_ply_with_bounds_that_are_not_finite(sound, bound, value, bad):
+    """The sizes of 256 Gaussians between -inf and a logarithm are unknown."""
     path, data = sound("compressed-ply")
     start = data.index(b"end_header\n") + 11 + 4 * BOUNDS.index(bound)
     path.write_bytes(data[:start] + struct.pack("<f", value) + data[start + 4 :])
-    refused(path, reason)
+    refused(path, f"256 of 300 Gaussians have {bad} that are not finite")
 
 
 def nan_first(kind, data):

@@ -143,11 +143,8 @@ LIES = {
 @pytest.mark.parametrize("case", LIES)
 def test_a_header_or_a_table_that_lies(tmp_path, case):
     change, word = LIES[case]
-    refused(
-        tmp_path / "a.spz",
-        spz_4(**({"streams": two(), "count": 2, "degree": 1} | change)),
-        word,
-    )
+    data = spz_4(**({"streams": two(), "count": 2, "degree": 1} | change))
+    refused(tmp_path / "a.spz", data, word)
 
 
 def far(size):
