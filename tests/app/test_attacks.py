@@ -74,11 +74,9 @@ def test_enclosed_areas_are_filled_and_cleared(program):
     pixels[20:40, 20:40] = 255
     output = program.result(TAKE, [given(program.upload(bytes_of(Image.fromarray(pixels))))])
     assert "1 enclosed area" in output["data"][3]
-    shown = [output["data"][2]["value"]["background"]["path"]]
-    shown += [
-        program.result(AREAS, [None])["data"][1]["value"]["background"]["path"] for _ in range(2)
-    ]
-    first, filled, cleared = (np.asarray(Image.open(path))[360, 360] for path in shown)
+    shown = [output["data"][2], *(program.result(AREAS, [None])["data"][1] for _ in range(2))]
+    paths = [editor["value"]["background"]["path"] for editor in shown]
+    first, filled, cleared = (np.asarray(Image.open(path))[360, 360] for path in paths)
     assert filled.min() == 255 > first.max() and (first == cleared).all()
 
 
@@ -101,9 +99,8 @@ def test_an_edit_that_is_none_is_one_line(served, program):
     full = bytes([255]) * (count // 8) + (bytes([2 ** (count % 8) - 1]) if count % 8 else b"")
 
     def written():
-        output = program.result(
-            EDIT - 2 - 2 * len(KINDS), [None, "10,000 faces", "No texture", False]
-        )
+        first = EDIT - 2 - 2 * len(KINDS)
+        output = program.result(first, [None, "10,000 faces", "No texture", False])
         return Path(output["data"][0]["value"][0]["path"]).stat().st_size
 
     before, good = written(), {"key": key, "elevation": 0, "removed": ""}
@@ -114,18 +111,16 @@ def test_an_edit_that_is_none_is_one_line(served, program):
     ):
         error = program.result(EDIT, [told, None, None])["error"]
         assert error.startswith("the edit: ") and "\n" not in error, told
-    told = {
-        "the removed parts are not those of this object": [b"", one[:-1], one + b"\0"],
-        "this removes all Gaussians": [full],
-    }
-    if count % 8:
-        told["the removed parts are not those of this object"].append(more)
-    for reason, all_removed in told.items():
-        for removed in all_removed:
-            data = [{**good, "removed": base64.b64encode(removed).decode()}, None, None]
-            assert program.result(EDIT, data)["error"] == reason
+
+    def removing(bits):
+        return [{**good, "removed": base64.b64encode(bits).decode()}, None, None]
+
+    for bits in (b"", one[:-1], one + b"\0", *([more] if count % 8 else [])):
+        said = program.result(EDIT, removing(bits))["error"]
+        assert said == "the removed parts are not those of this object"
+    assert program.result(EDIT, removing(full))["error"] == "this removes all Gaussians"
     assert written() == before
-    data = [{**good, "removed": base64.b64encode(one).decode()}, None, None]
+    data = removing(one)
     other = Program(served.host, dict(program.headers))  # another page of the same browser
     made_square(other)
     assert other.result(EDIT, data)["error"] == "this result has expired"
@@ -229,18 +224,13 @@ def test_what_is_not_http_is_not_answered(served, program):
 
 def test_the_job_of_a_closed_page_ends(served, program, private):
     """The next page does not wait until all files of the closed one are written."""
-    image = Image.new("RGB", (200, 200), "white")
-    image.paste((200, 30, 20), (50, 50, 150, 150))
-    program.result(TAKE, [given(program.upload(bytes_of(image)))])
-    assert "data" in program.result(MAKE, [None, None, None])
+    made_square(program)
     assert program.join(ZIP, [None, "200,000 faces", "Texture 2048", True]).status == 200
     cookie, host = f"Cookie: {program.headers['Cookie']}", f"Host: {served.host}"
     session = program.session
     places = f"heartbeat/{session}", f"queue/data?session_hash={session}"
     answers = [raw(served, f"GET /gradio_api/{p} HTTP/1.1", host, cookie)[0] for p in places]
-    assert "process_starts" in next(
-        line for line in map(bytes.decode, answers[1]) if "process_" in line
-    )
+    assert b"process_starts" in next(line for line in answers[1] if b"process_" in line)
     time.sleep(3)  # it is in the middle
     for answer in answers:
         answer.close()

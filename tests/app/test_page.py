@@ -13,6 +13,7 @@ import pytest
 from helpers.app import MEGABYTES, command, serving
 from helpers.browser import complains
 from helpers.children import ran
+from helpers.images import post
 from helpers.matting import matting_network
 from PIL import Image
 
@@ -358,13 +359,10 @@ def test_a_doubted_cut_out_is_made_again_by_a_network(browser_page, tmp_path, mo
     settings = {"U2NET_HOME": str(home), "GAMBA_OFFLINE": "0", "HTTPS_PROXY": closed}
     for name, value in settings.items():
         monkeypatch.setenv(name, value)
-    post = np.ones((60, 80, 3))
-    post[20:, 30:50] = RED  # down to the border
-    save_image(tmp_path / "post.png", post)
     with serving(tmp_path) as served:
         page = browser_page(served.address, 1280, 900).page
         page.context.set_default_timeout(1000 * PATIENCE)
-        give(page, tmp_path / "post.png")
+        give(page, post(tmp_path))
         page.wait_for_selector("#network:has-text('isnet-general-use, 179 MB, fetched once')")
         note = page.locator("#note").inner_text()
         assert "may be wrong" in note and "or use a network" in note and "gamba" not in note

@@ -9,7 +9,7 @@ from unittest.mock import MagicMock, Mock
 import numpy as np
 import pytest
 import torch
-from helpers.images import bad_files, cut_out
+from helpers.images import bad_files, cut_out, post
 from helpers.matting import matting_network
 from helpers.model import quick, run_reconstruct
 from helpers.refusals import refused
@@ -50,6 +50,11 @@ def edited(tmp_path_factory):
     return work.run_model(load_model(STARTER / "tiny.safetensors"), cut)
 
 
+def triangle():
+    corners = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0]], np.float64)
+    return extract.Surface(corners, np.array([[0, 1, 2]]))
+
+
 def test_a_image_from_above_stands_upright(tmp_path, edited):
     """Rotation like ``reconstruct --elevation``, in the viewer's camera and in every file."""
     image = cut_out(tmp_path / "thing.png")
@@ -58,9 +63,8 @@ def test_a_image_from_above_stands_upright(tmp_path, edited):
     turn = orbit(torch.zeros(1), 30.0)[0, :3, :3]
     torch.testing.assert_close(above.left.means @ turn.T, edited.left.means)
     assert above.view == edited.view.changed(30.0) and edited.view.elevation == 0
-    edited = replace(edited, name="thing", surface=None)
-    corners = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0]], np.float64)
-    edited.surface = extract.Surface(corners, np.array([[0, 1, 2]]))
+    edited = replace(edited, name="thing", surface=triangle())
+    corners = edited.surface.vertices
     nothing = bytes(-(-visible(edited.gaussians, "").num // 8))
     for elevation in (10.0, 30.0):  # rotations add up
         work.edit(edited, elevation, nothing)
@@ -109,14 +113,6 @@ def test_strokes_keep_and_remove(two, size):
     assert cutting.apply_strokes(cut, [np.zeros((*size, 4), np.uint8)]) is cut
 
 
-def post(folder):
-    """An image of a red post, which touches the border, so that its cut-out is doubted."""
-    rgb = np.ones((60, 80, 3))
-    rgb[20:, 30:50] = 0.8, 0.2, 0.1
-    save_image(folder / "post.png", rgb)
-    return folder / "post.png"
-
-
 def test_a_doubted_cut_out_has_no_command_but_a_network(tmp_path, monkeypatch):
     pytest.importorskip("onnxruntime", reason="needs onnxruntime: pip install '.[photo]'")
     options = CutoutOptions(notify=lambda line: None)
@@ -136,10 +132,8 @@ def test_a_doubted_cut_out_has_no_command_but_a_network(tmp_path, monkeypatch):
     assert first.network == "Cut out with a network (isnet-general-use, 179 MB, fetched once)"
     assert "or use a network" in first.note
 
-    def fail(*_):
-        raise UserError("github.com cannot be reached")
-
-    monkeypatch.setattr(models, "fetch", fail)
+    unreachable = UserError("github.com cannot be reached")
+    monkeypatch.setattr(models, "fetch", Mock(side_effect=unreachable))
     refused("network cannot be fetched: github.com cannot", cutting.cut_by_network, first, options)
     other, file = home / "silueta.onnx", home / "isnet-general-use.onnx"
     other.write_bytes(matting_network(bias=-400.0))
@@ -226,9 +220,8 @@ def test_without_an_object_it_can_be_painted(tmp_path):
 
 def test_no_images(tmp_path):
     for name, path, reason in bad_files(tmp_path):
-        said = refused(
-            re.escape(reason) or None, cutting.cut_image, path, "given.png", CutoutOptions()
-        )
+        given = path, "given.png", CutoutOptions()
+        said = refused(re.escape(reason) or None, cutting.cut_image, *given)
         assert said.startswith("given.png: ") and str(tmp_path) not in said, name
 
 
@@ -278,9 +271,8 @@ def test_a_mesh(edited, tmp_path, monkeypatch):
 
     def surface_of(gaussians, options, device, texture):
         asked.append((gaussians.num, options.faces, options.watertight, texture, str(device)))
-        corners = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]], np.float32)
         faces = np.array([[0, 1, 2], [0, 3, 1], [0, 2, 3], [1, 3, 2]])
-        return extract.Surface(corners, faces, np.full((4, 3), 0.5, np.float32))
+        return extract.Surface(np.eye(4, 3, -1), faces, np.full((4, 3), 0.5, np.float32))
 
     monkeypatch.setattr(extract, "surface_of", surface_of)
     for kind, suffix in (("mesh-stl", ".stl"), ("mesh-glb", ".glb")):
@@ -307,24 +299,23 @@ def test_what_is_removed_is_in_no_file(edited, tmp_path, monkeypatch):
     bits = np.zeros(seen.num, bool)
     bits[[0, 3, seen.num - 1]] = True
     edited.surface = Mock()
-    work.edit(edited, 0, np.packbits(bits, bitorder="little").tobytes())
+    removed = np.packbits(bits, bitorder="little").tobytes()
+    work.edit(edited, 0, removed)
     assert edited.surface is None and edited.left.num == edited.gaussians.num - 3
     left = visible(edited.left, "thing")
     torch.testing.assert_close(left.means, seen.means[~torch.from_numpy(bits)])
     for kind in ("ply", "splat"):
         path, note = work.write(edited, kind, tmp_path)
         assert read_gaussians(path).num == edited.left.drawn().num == seen.num - 3
-    asked = []
-    monkeypatch.setattr(extract, "surface_of", lambda gaussians, *_: asked.append(gaussians.num))
-    monkeypatch.setattr(
-        work, "turntable_frames", lambda gaussians, *_, **__: asked.append(gaussians.num)
-    )
-    monkeypatch.setattr(work, "save_turntable", lambda *_: None)
+    surface_of, turntable_frames = Mock(return_value=None), Mock()
+    monkeypatch.setattr(extract, "surface_of", surface_of)
+    monkeypatch.setattr(work, "turntable_frames", turntable_frames)
+    monkeypatch.setattr(work, "save_turntable", Mock())
     work.surface_of(edited, work.MESH)
     work.write(edited, "gif", tmp_path)
+    asked = [function.call_args.args[0].num for function in (surface_of, turntable_frames)]
     assert asked == [edited.left.num] * 2
     again = work.viewer(edited)
-    removed = np.packbits(bits, bitorder="little").tobytes()
     assert f'"count": {seen.num},' in again and base64.b64encode(removed).decode() in again
     work.edit(edited, 0, bytes(-(-seen.num // 8)))
     assert edited.left.num == edited.gaussians.num
@@ -377,9 +368,8 @@ def test_the_strip_keeps_the_last_results(page, monkeypatch):
     results, most = [], 12
     for count in (most - 1, 1, 1):
         assert not said
-        *_, (results, strip) = results_of(
-            page, map(str, range(len(results), most + 1)[:count]), results
-        )
+        names = map(str, range(len(results), most + 1)[:count])
+        *_, (results, strip) = results_of(page, names, results)
     names = [str(number) for number in range(1, most + 1)]
     assert [each.edited.name for each in results] == [name for _, name in strip] == names
     assert said == ["The strip keeps the last 12 results."]
@@ -406,13 +396,12 @@ def test_each_of_several_images_is_shown_once_it_is_done(page, edited, monkeypat
 
 def test_an_elevation_set_by_hand_stays_with_its_image(page, edited, monkeypatch):
     asked = []
-    monkeypatch.setattr(
-        work, "run_model", lambda _, cut, angle: asked.append(angle) or new(cut.key)
-    )
 
-    def new(key):
-        return replace(edited, name="a", image_key=key)
+    def run_model(_, cut, angle):
+        asked.append(angle)
+        return replace(edited, name="a", image_key=cut.key)
 
+    monkeypatch.setattr(work, "run_model", run_model)
     one, other = (Mock(key=key) for key in "ab")
     monkeypatch.setattr("gamba_warp.app.actions.apply_strokes", lambda cut, _: cut)
     results = []
@@ -464,6 +453,5 @@ def test_the_viewer_has_the_input_and_the_last_mesh(edited):
     edited = replace(edited, surface=None)
     bare = work.viewer(edited)
     assert '"faces": 0' in bare and '"image": "data:image/webp;base64,' in bare
-    corners = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0]], np.float64)
-    edited.surface = extract.Surface(corners, np.array([[0, 1, 2]]))
+    edited.surface = triangle()
     assert '"faces": 1,' in work.viewer(edited)

@@ -84,11 +84,10 @@ def test_what_is_read_is_never_an_output(tmp_path):
     photo.touch(), mask.touch(), out.mkdir()
     said = "photo.gif: would be overwritten by an output"
     refused(said, plan_outputs, [photo], [".ply", ".gif"], tmp_path)
-    refused(
-        "photo.html: would be overwritten", plan_outputs, [photo], [".html"], tmp_path, [None, mask]
-    )
     (out / "photo.ply").hardlink_to(mask)
-    refused("photo.html: would be overwritten", plan_outputs, [photo], [".ply"], out, [mask])
+    for suffix, folder in ((".html", tmp_path), (".ply", out)):
+        said = "photo.html: would be overwritten"
+        refused(said, plan_outputs, [photo], [suffix], folder, [None, mask])
     assert planned([photo], [".gif"], out) == ["photo"]
     (out / "photo.gif").touch()  # of an earlier run
     assert planned([photo], [".gif"], out, [tmp_path / "none"]) == ["photo"]

@@ -1,6 +1,7 @@
 """Odd images, and those of telephones, through ``gamba reconstruct``: a result, or one line."""
 
 import os
+import sys
 
 import numpy as np
 import pytest
@@ -19,12 +20,11 @@ from gamba_warp.model.posing import reference_cameras
 from gamba_warp.render import render
 
 SIDE = 40
-SMALL = dict(image_size=32, width=16, depth=1, state_size=4, encoder="none", encoder_size=16)
+SMALL = {"image_size": 32, "patch_size": 8, "width": 16, "depth": 1, "state_size": 4}
+SMALL |= {"encoder": "none", "encoder_size": 16}
 MODELS = {
-    "bins": GambaConfig(patch_size=8, **SMALL),
-    "rays": GambaConfig(
-        patch_size=8, decoder="rays", ray_cells=8, ray_layers=2, ray_features=8, **SMALL
-    ),
+    "bins": GambaConfig(**SMALL),
+    "rays": GambaConfig(decoder="rays", ray_cells=8, ray_layers=2, ray_features=8, **SMALL),
 }
 
 
@@ -40,7 +40,6 @@ def checkpoints(tmp_path_factory):
 def images():
     """Alpha of each image that has a result; the colour runs from side to side."""
     y, x = np.mgrid[:SIDE, :SIDE] / (SIDE - 1)
-    disc = (x - 0.5) ** 2 + (y - 0.5) ** 2 < 0.16
     corner = np.ones((SIDE, SIDE))
     corner[0, 0] = 0
     return {
@@ -48,7 +47,7 @@ def images():
         "side": (x - 0.9) ** 2 + (y - 0.5) ** 2 < 0.1,
         "line": np.abs(x - 0.5) < 0.02,
         "soft": np.clip(1 - 2 * np.hypot(x - 0.5, y - 0.5), 0, 1),
-        "white": disc,
+        "white": (x - 0.5) ** 2 + (y - 0.5) ** 2 < 0.16,
     }
 
 
@@ -140,8 +139,6 @@ def test_images_of_telephones(tmp_path):
 
 
 def test_a_heic_without_its_reader_says_what_it_needs(tmp_path, monkeypatch):
-    import sys
-
     (tmp_path / "a.heic").write_bytes(b"\0\0\0\x18ftypheic\0\0\0\0mif1heic" + b"\0" * 99)
     monkeypatch.setitem(sys.modules, "pillow_heif", None)
     refused(r"a\.heic: .*pip install '\.\[photo\]'", load_rgba, tmp_path / "a.heic")

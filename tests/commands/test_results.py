@@ -15,6 +15,8 @@ from gamba_warp.cli import run
 from gamba_warp.commands.results import Results
 from gamba_warp.formats.ply import load_ply, save_ply
 
+COARSE = ["--voxels", "24", "--views", "8", "--pixels", "48"]
+
 
 @pytest.fixture
 def splats(tmp_path):
@@ -25,9 +27,8 @@ def splats(tmp_path):
 
 def test_the_text_counts_inputs_and_failures():
     def text(count, *failed):
-        return Results(
-            "file", count, Path("out"), [(Path(name), "empty") for name in failed]
-        ).text()
+        failures = [(Path(name), "empty") for name in failed]
+        return Results("file", count, Path("out"), failures).text()
 
     assert text(2) == "2 files, 0 failures, results in out"
     assert text(2, "a.ply") == "2 files, 1 failure, results in out"
@@ -43,8 +44,7 @@ def test_one_file_on_the_standard_output(tmp_path, checkpoint, splats, capfdbina
     (tmp_path / "made.ply").write_bytes(made.out)
     assert load_ply(tmp_path / "made.ply").num == 64
     assert b"thing: 64 Gaussians." in made.err and made.err.endswith(b"1 image, 0 failures\n")
-    options = ["--mesh", "stl", "--voxels", "24", "--views", "8", "--pixels", "48", "--out", "-"]
-    assert run("export", [splats, *options]) == 0
+    assert run("export", [splats, "--mesh", "stl", *COARSE, "--out", "-"]) == 0
     made = capfdbinary.readouterr()
     assert len(made.out) == 84 + 50 * int.from_bytes(made.out[80:84], "little")
     assert b"Mesh: " in made.err
@@ -54,8 +54,7 @@ def test_one_file_on_the_standard_output(tmp_path, checkpoint, splats, capfdbina
     assert run("export", [splats, "-o", "-", "--mesh", "--splats", "ply", "spz"]) == 2
     made = capfdbinary.readouterr()
     assert not made.out
-    message = b"--out - writes one file, but 2 were made: thing.ply, thing.spz\n"
-    assert made.err.endswith(message)
+    assert made.err.endswith(b"--out - writes one file, but 2 were made: thing.ply, thing.spz\n")
     assert {path.name for path in tmp_path.iterdir()} == {"thing.ply", "thing.png", "made.ply"}
 
 
@@ -75,22 +74,16 @@ def test_results_as_json(tmp_path, checkpoint, splats, capsys):
     assert made["failures"] == [{"input": str(missing), "reason": "no such file"}]
     (result,) = made["results"]
     assert sorted(result.pop("files")) == sorted(path.name for path in out.iterdir())
-    doubt = result.pop("elevation_doubt")
-    assert (
-        result.pop("cutout")
-        and -20 <= (elevation := result.pop("elevation")) <= 65
-        and (doubt is None or doubt[0] <= elevation <= doubt[1])
-        and result
-        == {"input": str(image), "name": "thing", "warning": "", "gaussians": 64, "notes": []}
-    )
-    options = ["--mesh", "ply", "--voxels", "24", "--views", "8", "--pixels", "48", "--json"]
+    doubt, elevation = result.pop("elevation_doubt"), result.pop("elevation")
+    assert result.pop("cutout") and -20 <= elevation <= 65
+    assert doubt is None or doubt[0] <= elevation <= doubt[1]
+    want = {"input": str(image), "name": "thing", "warning": "", "gaussians": 64, "notes": []}
+    assert result == want
+    options = ["--mesh", "ply", *COARSE, "--json"]
     assert run("export", [splats, "--out", str(out), *options]) == 0
     (result,) = json.loads(capsys.readouterr().out)["results"]
-    assert result["files"] == ["thing-mesh.ply"] and set(result["mesh"]) == {
-        "vertices",
-        "faces",
-        "closed",
-    }
+    assert result["files"] == ["thing-mesh.ply"]
+    assert set(result["mesh"]) == {"vertices", "faces", "closed"}
     refused_command(capsys, "export", [splats, "-o", "-", "--json"], "--json cannot, too")
     assert run("export", ["-q", splats, "--out", str(out), *options]) == 0
     texts = capsys.readouterr()

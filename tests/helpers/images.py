@@ -120,6 +120,14 @@ def cut_out(path, colour=(0.8, 0.3, 0.1)):
     return path
 
 
+def post(folder):
+    """Write an image whose cut-out is doubted: a red post down to the border; return its path."""
+    rgb = np.ones((60, 80, 3))
+    rgb[20:, 30:50] = 0.8, 0.2, 0.1
+    save_image(folder / "post.png", rgb)
+    return folder / "post.png"
+
+
 def disc_on_noise(size: tuple[int, int], seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
     """A red disc in the middle of blue and green blocks, ``[H, W, 3]``, and its alpha."""
     height, width = size
