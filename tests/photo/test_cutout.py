@@ -10,7 +10,7 @@ from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
 import numpy as np
 import pytest
 from helpers.cutouts import iou
-from helpers.images import disc_on_noise
+from helpers.images import disc_on_noise, post
 from helpers.matting import matting_network
 from helpers.refusals import refused
 from PIL import Image
@@ -64,10 +64,8 @@ def test_each_way_in_its_order(tmp_path, network, busy):
         assert found.rgba.shape[0] == found.rgba.shape[1] and found.rgba.dtype == np.float32
         assert found.note.startswith(found.how) and "--save-inputs" in found.note
     assert "red.onnx" in cut_out(path, options).how
-    said: list[str] = []
-    found = cut_out(
-        path, CutoutOptions(notify=said.append)
-    )  # conftest.py forbids the network; none is kept
+    said: list[str] = []  # conftest.py forbids the network; none is kept
+    found = cut_out(path, CutoutOptions(notify=said.append))
     assert found.method == "grabcut" and iou(found.mask, alpha) > 0.85
     assert " (no matting model)." in found.how and len(said) == 1
     assert "no matting model is here" in said[0] and models.PUBLISHED[0].address in said[0]
@@ -139,8 +137,8 @@ def test_a_cached_network_comes_before_colours(tmp_path, monkeypatch, network, b
     assert cut_out(tmp_path / "plain.png").method == "matte"
 
 
-def box(top, bottom, left, right, value=1.0):
-    alpha = np.zeros((100, 120), np.float32)
+def box(top, bottom, left, right, value=1.0, size=(100, 120)):
+    alpha = np.zeros(size, np.float32)
     alpha[top:bottom, left:right] = value
     return alpha
 
@@ -162,17 +160,12 @@ def test_doubts_are_said(alpha, color, reason):
 
 
 def test_a_doubt_names_the_way_to_a_network_unless_it_is_refused(tmp_path, monkeypatch):
-    rgb = np.ones((60, 80, 3))
-    rgb[20:, 30:50] = 0.8, 0.2, 0.1  # down to the lower edge
-    save_image(tmp_path / "post.png", rgb)
-    options = CutoutOptions(notify=lambda line: None)
+    path, options = post(tmp_path), CutoutOptions(notify=lambda line: None)
     about = "isnet-general-use, 179 MB, Apache 2.0, fetched once"
-    advice = (
-        f"Try a network: gamba reconstruct --cutout matte ({about})"  # the app has no such choice
-    )
-    assert advice in cut_out(tmp_path / "post.png", options).warning
+    advice = f"Try a network: gamba reconstruct --cutout matte ({about})"  # not said in the app
+    assert advice in cut_out(path, options).warning
     assert options.matte() is None
-    found = cut_out(tmp_path / "post.png", options)
+    found = cut_out(path, options)
     assert found.warning.endswith("it touches the image's border.") and found.warning in found.note
 
 
@@ -195,8 +188,7 @@ def test_a_matte_without_an_object_gives_way(tmp_path, busy):
 def test_sam_comes_before_the_matte(network, busy, monkeypatch):
     path, alpha = busy
     options = CutoutOptions(matte_model=network, sam="sam.pth")
-    square = np.zeros(SIZE, np.float32)
-    square[40:100, 60:140] = 1
+    square = box(40, 100, 60, 140, size=SIZE)
     monkeypatch.setattr(cutout, "SamSegmenter", lambda *_: lambda rgb: square)
     found = cut_out(path, options)
     assert found.method == "sam" and iou(found.mask, square) > 0.95  # less a boundary of background
@@ -260,10 +252,9 @@ def test_the_cut_out_can_be_mended_and_given_again(tmp_path, network, busy):
 
 def soft(fraction):
     """A mask of 600 pixels, of which those of this fraction of alpha's sum have an alpha of 0.8."""
-    alpha = np.zeros((40, 50), np.float32)
     full = round(600 * 0.8 * (1 - fraction) / (0.8 * (1 - fraction) + fraction))
-    alpha[10:30, 10:40] = np.where(np.arange(600) < full, 1.0, 0.8).reshape(20, 30)
-    return alpha
+    inner = np.where(np.arange(600) < full, 1.0, 0.8).reshape(20, 30)
+    return np.pad(inner, 10).astype(np.float32)
 
 
 @pytest.mark.parametrize(
@@ -315,19 +306,15 @@ def test_the_network_is_asked_only_once_and_never_in_silence(tmp_path, monkeypat
     assert cut_out(path, CutoutOptions(notify=said.append)).method == "grabcut"
     assert not asked and "no matting model is here" in said.pop()  # GAMBA_OFFLINE
     monkeypatch.setenv("GAMBA_OFFLINE", "0")
-    assert (
-        cut_out(path, CutoutOptions(fetch=False, notify=said.append)).method == "grabcut"
-        and not asked
-    )
-    assert "no matting model is here" in said.pop() and not said
+    assert cut_out(path, CutoutOptions(fetch=False, notify=said.append)).method == "grabcut"
+    assert "no matting model is here" in said.pop() and not said and not asked
     options = CutoutOptions(notify=said.append)
     for _ in range(2):
         found = cut_out(path, options)
         assert found.method == "grabcut" and " (no matting model)." in found.how
     ((address, digest, before),) = asked
-    assert (
-        address == models.PUBLISHED[0].address and digest == f"sha256:{models.PUBLISHED[0].sha256}"
-    )
+    first = models.PUBLISHED[0]
+    assert (address, digest) == (first.address, f"sha256:{first.sha256}")
     assert len(before) == 1 and address in before[0] and "179 MB" in before[0]
     assert len(said) == 2 and "github.com cannot be reached" in said[1]  # once, of two images
 
@@ -380,10 +367,8 @@ def mirror(tmp_path, monkeypatch):
 
 def test_a_model_comes_from_the_address_of_a_copy(tmp_path, monkeypatch, busy, mirror):
     said = []
-    options = CutoutOptions(
-        matte_model=f"{mirror}/u2netp.onnx?download=true", notify=said.append
-    ).checked()
-    how = cut_out(busy[0], options).how
+    options = CutoutOptions(matte_model=f"{mirror}/u2netp.onnx?download=true", notify=said.append)
+    how = cut_out(busy[0], options.checked()).how
     assert how.startswith("The matting model u2netp.onnx cut the object out.")
     assert len(said) == 1 and f"from {mirror}" in said[0] and models.cached() is not None
     (tmp_path / "rembg" / "models" / "u2netp" / "u2netp.onnx").unlink()
@@ -429,10 +414,9 @@ def test_a_few_transparent_pixels_are_no_cut_out(tmp_path, kind):
     rgba[inside, :3] = (200, 30, 40)
     if kind == "rounded corners":
         for top, left in ((0, 0), (0, 152), (112, 0), (112, 152)):
-            corner = (
-                np.mgrid[:8, :8] - np.array([[[7 - 7 * (top > 0)]], [[7 - 7 * (left > 0)]]])
-            ) ** 2
-            rgba[top : top + 8, left : left + 8, 3][corner.sum(0) > 49] = 0
+            down, right = np.mgrid[:8, :8]
+            far = np.hypot(down - 7 * (top == 0), right - 7 * (left == 0)) > 7
+            rgba[top : top + 8, left : left + 8, 3][far] = 0
     else:
         rgba[:2, :3, 3] = rgba[-2:, -3:, 3] = 0
     Image.fromarray(rgba).save(tmp_path / "a.png")
@@ -442,8 +426,7 @@ def test_a_few_transparent_pixels_are_no_cut_out(tmp_path, kind):
     kept = found.mask > 0.5
     assert (kept & inside).sum() > 0.95 * (kept | inside).sum()
     assert any("no cut-out" in line for line in said)
-    alone = cut_out(tmp_path / "a.png", CutoutOptions(cutout="alpha"))
-    assert alone.method == "alpha"
+    assert cut_out(tmp_path / "a.png", CutoutOptions(cutout="alpha")).method == "alpha"
 
 
 @pytest.mark.parametrize("spread", [0, 1], ids=["one colour", "noise"])
@@ -487,20 +470,14 @@ def test_a_small_object_of_a_large_image_keeps_its_pixels(tmp_path, network, way
     rgb = np.full((960, 1280, 3), 235, np.uint8)
     rgb[inside] = np.stack([stripes, stripes // 8, stripes // 9], -1)[inside]
     alpha = (255 * inside).astype(np.uint8)
-    part = slice(400, 600), slice(650, 950)
-    names = []
-    for name, at in (("whole", (slice(None), slice(None))), ("part", part)):
-        image = np.dstack([rgb, alpha])[at] if way == "alpha" else rgb[at]
-        Image.fromarray(np.ascontiguousarray(image)).save(tmp_path / f"{name}.png")
-        Image.fromarray(np.ascontiguousarray(alpha[at])).save(tmp_path / f"{name}-mask.png")
-        names.append(tmp_path / f"{name}.png")
-    found = []
-    for name in names:
-        mask = name.with_name(f"{name.stem}-mask.png") if way == "mask" else None
-        model = network if way == "matte" else None
-        cutout = way if way == "matte" else "auto"
-        options = CutoutOptions(mask=mask, matte_model=model, fetch=False, cutout=cutout)
-        found.append(cut_out(name, options))
+    image = np.dstack([rgb, alpha]) if way == "alpha" else rgb
+    mask, found = tmp_path / "mask.png", []
+    for rows, columns in ((slice(960), slice(1280)), (slice(400, 600), slice(650, 950))):
+        Image.fromarray(image[rows, columns].copy()).save(tmp_path / "a.png")
+        Image.fromarray(alpha[rows, columns].copy()).save(mask)
+        chosen = {"matte": dict(matte_model=network, cutout=way), "mask": dict(mask=mask)}
+        options = CutoutOptions(fetch=False, **chosen.get(way, {}))
+        found.append(cut_out(tmp_path / "a.png", options))
     whole, close = found
     assert whole.method == close.method == way
     assert abs(len(whole.rgba) - len(close.rgba)) <= 4 and len(whole.rgba) >= 200

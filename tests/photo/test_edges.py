@@ -140,9 +140,8 @@ def test_a_image_keeps_no_fringe_of_its_background(tmp_path):
     assert "is the cut-out." in cut_out(tmp_path / "clean.png").how
     save_image(tmp_path / "photo.png", mixed(clean, 0.9)[..., :3])
     save_image(tmp_path / "mask.png", clean[..., 3])
-    photo = cut_out(
-        tmp_path / "photo.png", CutoutOptions(mask=tmp_path / "mask.png", recenter=False)
-    )
+    options = CutoutOptions(mask=tmp_path / "mask.png", recenter=False)
+    photo = cut_out(tmp_path / "photo.png", options)
     edge = (clean[..., 3] > 0.3) & (clean[..., 3] < 0.9)
     for cut in (icon, photo):
         inner = cut.editable[edge]

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import torch
 from helpers.model import run_reconstruct
+from helpers.views import cloud_of
 
 from gamba_warp.app import cutting, work
 from gamba_warp.files import STARTER
@@ -18,6 +19,7 @@ from gamba_warp.trajectories.elevation import UNKNOWN, estimate_elevation
 from gamba_warp.trajectories.paths import upright
 
 ICON = STARTER / "icons" / "scopia-cardboard-box.png"
+GREY = (0.5, 0.5, 0.5)
 
 
 def table(count=4000) -> Gaussians:
@@ -26,9 +28,7 @@ def table(count=4000) -> Gaussians:
     top = rng.uniform([-0.4, -0.25, -0.25], [0.4, -0.2, 0.25], (count, 3))
     corners = rng.choice([-1, 1], (count, 2)) * [0.37, 0.22]
     legs = np.stack([corners[:, 0], rng.uniform(-0.2, 0.25, count), corners[:, 1]], 1)
-    means = torch.tensor(np.concatenate([top, legs + rng.normal(0, 0.01, legs.shape)])).float()
-    alike = torch.ones(len(means))
-    return Gaussians(means, None, 0.01 * alike[:, None].expand(-1, 3), alike, 0.5 + 0 * means)
+    return cloud_of(np.concatenate([top, legs + rng.normal(0, 0.01, legs.shape)]), 0.01, 1.0, GREY)
 
 
 @pytest.mark.parametrize("elevation", [-8, 0, 17, 40])
@@ -52,9 +52,7 @@ def test_a_table_is_set_upright(elevation):
 def test_a_ball_leaves_the_elevation_in_doubt(capsys, tmp_path):
     """Its profile is the same from all sides; a line says so, with the quartiles."""
     means = torch.nn.functional.normalize(torch.randn(4000, 3), dim=-1) / 2
-    alike = torch.ones(len(means))
-    ball = Gaussians(means, None, 0.01 * alike[:, None].expand(-1, 3), alike, 0.5 + 0 * means)
-    found = estimate_elevation(ball)
+    found = estimate_elevation(cloud_of(means, 0.01, 1.0, GREY))
     assert found.doubtful and found.low < found.degrees < found.high
     assert str(found) == f"{found.degrees} degrees, in doubt ({found.low} to {found.high})"
     (icon,) = (STARTER / "icons").glob("*-fordfocus.png")
@@ -68,8 +66,7 @@ def test_a_ball_leaves_the_elevation_in_doubt(capsys, tmp_path):
 
 def test_invalid_gaussians_do_not_count():
     broken = table()
-    broken.means[::7], broken.scales = torch.nan, broken.scales.clone()
-    broken.scales[3::7] = torch.inf
+    broken.means[::7], broken.scales[3::7] = torch.nan, torch.inf
     assert abs(estimate_elevation(broken).degrees) <= 6
 
 

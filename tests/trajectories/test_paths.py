@@ -52,8 +52,8 @@ def test_a_turntable_begins_in_front_and_turns_once():
     assert (cameras.width, cameras.height) == (70, 50)
     # The field of view is that of the shorter side, so a tall image shows a ball whole as well.
     tall = turntable(1, Viewpoint(0.0, 2.5, 30.0), (50, 70))
-    assert float(tall.Ks[0, 0, 0]) == pytest.approx(25 / math.tan(math.radians(15)))
-    assert float(tall.Ks[0, 1, 1]) == pytest.approx(25 / math.tan(math.radians(15)))
+    focal = 25 / math.tan(math.radians(15))
+    assert tall.Ks[0].diagonal().tolist() == pytest.approx([focal, focal, 1])
 
 
 def test_a_spiral_rises_falls_and_closes():
@@ -73,10 +73,9 @@ def test_a_spiral_rises_falls_and_closes():
 def test_another_field_of_view_keeps_the_object_as_large():
     before, after = Viewpoint(), Viewpoint().changed(fov=20.0, elevation=12.0)
     assert after.elevation == 12.0 and after.fov == 20.0
-    for point in (before, after):  # the half height of the image at the object's centre
-        assert point.distance * math.tan(math.radians(point.fov / 2)) == pytest.approx(
-            1.5 * math.tan(math.radians(49.1 / 2))
-        )
+    # The half height of the image at the object's centre.
+    heights = [p.distance * math.tan(math.radians(p.fov / 2)) for p in (before, after)]
+    assert heights == pytest.approx([1.5 * math.tan(math.radians(49.1 / 2))] * 2)
     assert Viewpoint().changed(fov=20.0, distance=3.0).distance == 3.0
 
 
@@ -143,71 +142,42 @@ def test_two_forms_of_the_same_cameras(tmp_path):
 def test_another_size_keeps_the_vertical_field_of_view(tmp_path):
     K = intrinsics(40, 20, 50.0).double()
     save_path(tmp_path / "a.json", Cameras(rigid(1), K[None], 40, 20))
-    same = load_path(tmp_path / "a.json", (80, None)).cameras
-    assert (same.width, same.height) == (80, 40)
-    want = intrinsics(80, 40, 50.0).double()
-    torch.testing.assert_close(same.Ks[0], want, rtol=1e-6, atol=1e-5)
-    square = load_path(tmp_path / "a.json", (60, 60)).cameras
-    want = intrinsics(60, 60, 50.0).double()
-    torch.testing.assert_close(square.Ks[0], want, rtol=1e-6, atol=1e-5)
+    for given, size in (((80, None), (80, 40)), ((60, 60), (60, 60))):
+        cameras = load_path(tmp_path / "a.json", given).cameras
+        assert (cameras.width, cameras.height) == size
+        want = intrinsics(*size, 50.0).double()
+        torch.testing.assert_close(cameras.Ks[0], want, rtol=1e-6, atol=1e-5)
 
 
-EYE = np.eye(4).tolist()
+EYE = {"transform_matrix": np.eye(4).tolist()}
+TWICE = {"transform_matrix": (2 * np.eye(4)).tolist()}
+MIRROR = {"transform_matrix": np.diag([1.0, 1, -1, 1]).tolist()}
 HEAD = {"w": 32, "h": 32, "fl_x": 9}
-BEHIND = [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 2], [0, 0, 0, 1]]
+NERFSTUDIO = {"render_width": 9, "render_height": 9}
+FLAT = {"camera_to_world": np.eye(4).ravel().tolist(), "fov": 50}
+TORN = {"camera_to_world": [*np.eye(4).ravel()[:14], 1, 1], "fov": 50}
 BAD = {
-    "no form": ({"a": 1}, "not a known camera file"),
-    "a number": (3, "not a known camera file"),
-    "no frames": ({**HEAD, "frames": []}, "no frames"),
-    "no angle": ({"frames": [{"transform_matrix": EYE}]}, "no camera: needs w, h, fl_x"),
-    "speed": ({**HEAD, "fps": 0, "frames": [{"transform_matrix": EYE}]}, "fps"),
-    "scaled": (
-        {**HEAD, "frames": [{"transform_matrix": x} for x in (EYE, (2 * np.eye(4)).tolist())]},
-        "frame 1: the",
-    ),
-    "mirror": (
-        {**HEAD, "frames": [{"transform_matrix": np.diag([1.0, 1, -1, 1]).tolist()}]},
-        "frame 0: the",
-    ),
-    "focal": ({**HEAD, "fl_x": 1e-3, "frames": [{"transform_matrix": EYE}]}, "frame 0: "),
-    "fisheye": (
-        {
-            "camera_type": "fisheye",
-            "render_width": 9,
-            "render_height": 9,
-            "camera_path": [{"camera_to_world": np.eye(4).ravel().tolist(), "fov": 50}],
-        },
-        "only perspective is rendered",
-    ),
-    "last row": (
-        {
-            "render_width": 9,
-            "render_height": 9,
-            "camera_path": [{"camera_to_world": [*np.eye(4).ravel()[:14], 1, 1], "fov": 50}],
-        },
-        "frame 0: the pose's last row is not 0 0 0 1",
-    ),
-    "lens": (
-        {"w": 9, "h": 9, "fl_x": 9, "k1": 0.5, "frames": [{"transform_matrix": [[1]]}]},
-        "the pose has shape",
-    ),
-    "pixels of no size": (
-        {"camera_angle_x": 1, "cx": 9, "frames": [{"transform_matrix": np.eye(4).tolist()}]},
-        "cx is in pixels, so w and h are needed",
-    ),
-    "sizes": (
-        {
-            "camera_angle_x": 1,
-            "frames": [{"transform_matrix": BEHIND, "w": side, "h": 9} for side in (8, 9)],
-        },
-        "cameras of different sizes",
-    ),
+    "not a known camera file": {"a": 1},
+    "camera file": 3,
+    "no frames": {**HEAD, "frames": []},
+    "no camera: needs w, h, fl_x": {"frames": [EYE]},
+    "fps": {**HEAD, "fps": 0, "frames": [EYE]},
+    "frame 1: the": {**HEAD, "frames": [EYE, TWICE]},
+    "frame 0: the": {**HEAD, "frames": [MIRROR]},
+    "frame 0: ": {**HEAD, "fl_x": 1e-3, "frames": [EYE]},
+    "only perspective": {**NERFSTUDIO, "camera_type": "fisheye", "camera_path": [FLAT]},
+    "frame 0: the pose's last row is not 0 0 0 1": {**NERFSTUDIO, "camera_path": [TORN]},
+    "the pose has shape": {**HEAD, "k1": 0.5, "frames": [{"transform_matrix": [[1]]}]},
+    "cx is in pixels, so w and h are needed": {"camera_angle_x": 1, "cx": 9, "frames": [EYE]},
+    "cameras of different sizes": {
+        "camera_angle_x": 1,
+        "frames": [EYE | {"w": side, "h": 9} for side in (8, 9)],
+    },
 }
 
 
-@pytest.mark.parametrize("name", BAD)
-def test_bad_files_are_one_line(tmp_path, name):
-    value, words = BAD[name]
-    path = write(tmp_path / "cameras.json", value)
+@pytest.mark.parametrize("words", BAD)
+def test_bad_files_are_one_line(tmp_path, words):
+    path = write(tmp_path / "cameras.json", BAD[words])
     text = refused(None, load_path, path)
     assert text.startswith(str(path)) and words in text
