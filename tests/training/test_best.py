@@ -43,14 +43,10 @@ def test_the_best_is_by_novel_views(data, tmp_path, monkeypatch):
     scripted(monkeypatch, [15, 15.5, 15, float("nan"), 0, 14])
     changes = {"val_every": 1, "save_every": 1}
     assert micro.run(data, tmp_path, run=changes) == 0
-    assert [(line["step"], line["psnr"]) for line in micro.lines(tmp_path, "best")] == [
-        (1, 15.0),
-        (2, 15.5),
-    ]
-    same = [
-        micro.same_weights(path / "ema.safetensors", tmp_path / "best.safetensors")
-        for path in list_checkpoints(tmp_path)
-    ]
+    best = [(line["step"], line["psnr"]) for line in micro.lines(tmp_path, "best")]
+    assert best == [(1, 15.0), (2, 15.5)]
+    averages = [path / "ema.safetensors" for path in list_checkpoints(tmp_path)]
+    same = [micro.same_weights(each, tmp_path / "best.safetensors") for each in averages]
     assert same == [False, True, False, False, False, False]
 
 
@@ -85,9 +81,8 @@ def test_a_fine_tuning_is_validated_before_it_begins(data, tmp_path, capsys):
     *_, warning = (line["message"] for line in micro.lines(tmp_path / "second", "warning"))
     assert "the last validation is worse than the first: PSNR" in warning
     assert "dB at step 0; best.safetensors has" in warning and warning in capsys.readouterr().out
-    assert micro.same_weights(
-        tmp_path / "second" / "best.safetensors", tmp_path / "first" / "model.safetensors"
-    )
+    best, first = tmp_path / "second/best.safetensors", tmp_path / "first/model.safetensors"
+    assert micro.same_weights(best, first)
 
 
 def test_a_validation_at_the_start_changes_no_bit(data, tmp_path):
@@ -95,6 +90,5 @@ def test_a_validation_at_the_start_changes_no_bit(data, tmp_path):
     for name, every in (("with", 100), ("without", 0)):
         out = tmp_path / name
         assert micro.run(data, out, run={"init": tmp_path / "first", "val_every": every}) == 0
-    assert micro.same_weights(
-        tmp_path / "with/model.safetensors", tmp_path / "without/model.safetensors"
-    )
+    files = (tmp_path / name / "model.safetensors" for name in ("with", "without"))
+    assert micro.same_weights(*files)

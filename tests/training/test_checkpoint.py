@@ -4,8 +4,11 @@ import copy
 import errno
 import math
 import os
+import pickle
 import zipfile
+from dataclasses import replace
 from pathlib import Path
+from unittest.mock import Mock
 
 import pytest
 import torch
@@ -54,8 +57,8 @@ def test_round_trip(tmp_path, model):
 def test_keeps_the_newest(tmp_path, model):
     for step in (5, 90, 100, 1_000_000):
         save_checkpoint(tmp_path, step, {"model": model}, {}, keep=2)
+    assert names(tmp_path) == sorted(os.listdir(tmp_path / "checkpoints"))
     assert names(tmp_path) == ["step_000100", "step_1000000"]
-    assert sorted(os.listdir(tmp_path / "checkpoints")) == ["step_000100", "step_1000000"]
     assert find_checkpoint(tmp_path, "auto").name == "step_1000000"
 
 
@@ -70,11 +73,7 @@ def test_same_step_is_replaced(tmp_path, model):
 )
 def test_full_disk_leaves_the_old_one(tmp_path, model, monkeypatch, error):
     save_checkpoint(tmp_path, 1, {"model": model}, {"a": 1}, keep=1)
-
-    def full(*arguments):
-        raise error
-
-    monkeypatch.setattr(checkpoint.torch, "save", full)
+    monkeypatch.setattr(checkpoint.torch, "save", Mock(side_effect=error))
     said = "cannot write .*step_000002"
     refused(said, save_checkpoint, tmp_path, 2, {"model": model}, {"a": 2}, keep=1)
     assert names(tmp_path) == ["step_000001"]
@@ -122,8 +121,6 @@ def test_missing_files(tmp_path, model):
 
 
 def test_code_in_a_state_file_is_not_run(tmp_path):
-    import pickle
-
     class Evil:
         def __reduce__(self):
             return os.mkdir, (str(tmp_path / "owned"),)
@@ -136,8 +133,6 @@ def test_code_in_a_state_file_is_not_run(tmp_path):
 
 
 def test_other_model_is_named(tmp_path, model):
-    from dataclasses import replace
-
     path = save_checkpoint(tmp_path, 1, {"model": model}, {}, keep=1)
     other = Gamba(replace(model.config, width=24, norm="rms"))
     refused("a different width, norm", load_weights, path / "model.safetensors", other)
@@ -230,10 +225,7 @@ def test_fields_of_a_state_are_checked(field, value):
         (lambda s: s["state"].update({99: {}}), "parameter '99'"),
         (lambda s: s["state"][0].pop("step"), "parameter 0 has other fields"),
         (lambda s: s["state"].update({0: 5}), "parameter 0 has other fields"),
-        (
-            lambda s: s["state"][0].update(exp_avg=torch.ones(3)),
-            "parameter 0 has shape",
-        ),
+        (lambda s: s["state"][0].update(exp_avg=torch.ones(3)), "parameter 0 has shape"),
         (lambda s: s["state"][0].update(exp_avg=1.0), "exp_avg of parameter 0 is not a float32"),
         (lambda s: s["state"][0].update(step=torch.ones((), dtype=torch.int64)), "not a float32"),
         (lambda s: s["state"][0]["exp_avg"].fill_(math.nan), "exp_avg .* not finite"),
@@ -266,25 +258,22 @@ def repacked(path, change, packing=zipfile.ZIP_STORED):
 
 def test_a_state_that_claims_more_than_it_holds(tmp_path):
     path = tmp_path / "state.pt"
-
     torch.save({"a": torch.arange(10.0)}, path)
     repacked(path, lambda data: data.replace(b"K\x0a", b"J\x40\x42\x0f\x00"))  # 10 to 1,000,000
     refused("state.pt: damaged.*", read_state, tmp_path)
     torch.save({"a": torch.arange(10.0)}, path)
     repacked(path, lambda data: data, zipfile.ZIP_DEFLATED)
     refused("state.pt: damaged.*compressed", read_state, tmp_path)
-    torch.save({"a": torch.ones(1).expand(10**6, 10**6)}, path)  # one number, 4 TB after a copy
-    refused("state.pt: damaged.*larger than the file", read_state, tmp_path)
-    endless = []
+    endless, wide = [], [0]
     endless.append(endless)
-    torch.save({"a": endless}, path)
-    refused("state.pt: damaged.*nested deeper", read_state, tmp_path)
-    wide = [0]
     for _ in range(12):
         wide = [wide] * 10
-    torch.save({"a": wide}, path)
-    refused("state.pt: damaged.*over 1,000,000 values", read_state, tmp_path)
-    torch.save([1], path)
-    refused("state.pt: damaged.*not contain the state", read_state, tmp_path)
-    torch.save({"a": torch.ones(3).to_sparse()}, path)
-    refused("state.pt: damaged.*not dense", read_state, tmp_path)
+    for value, words in (
+        ({"a": torch.ones(1).expand(10**6, 10**6)}, "larger than the file"),  # 4 TB after a copy
+        ({"a": endless}, "nested deeper"),
+        ({"a": wide}, "over 1,000,000 values"),
+        ([1], "not contain the state"),
+        ({"a": torch.ones(3).to_sparse()}, "not dense"),
+    ):
+        torch.save(value, path)
+        refused(f"state.pt: damaged.*{words}", read_state, tmp_path)

@@ -3,6 +3,7 @@
 import json
 import os
 import signal
+from unittest.mock import Mock
 
 import pytest
 import torch
@@ -44,9 +45,8 @@ def test_a_log_that_cannot_be_written_is_said_once_and_training_goes_on(data, tm
     (out / "log.jsonl").symlink_to("/dev/full")
     assert run(data, out, length={"steps": 3}) == 0
     said = capsys.readouterr().out
-    assert (
-        said.count("log.jsonl cannot be written, the run continues: No space left on device") == 1
-    )
+    line = "log.jsonl cannot be written, the run continues: No space left on device"
+    assert said.count(line) == 1
 
 
 def test_a_log_is_of_whole_lines_whatever_happens(tmp_path, capsys):
@@ -67,11 +67,7 @@ def test_a_log_is_of_whole_lines_whatever_happens(tmp_path, capsys):
 def test_tensorboard_never_stops_a_run(tmp_path, capsys):
     pytest.importorskip("tensorboard")
     log = RunLog(tmp_path)
-
-    def full(*arguments):
-        raise OSError(28, "No space left on device")
-
-    log._board.add_scalar = full
+    log._board.add_scalar = Mock(side_effect=OSError(28, "No space left on device"))
     for step in range(3):
         log.write("train", step, loss=1.0)
     log.close()
@@ -101,9 +97,8 @@ def test_a_second_trainer_is_refused_and_a_dead_one_is_not_waited_for(data, tmp_
     arguments = [str(data), "--out", str(out), "--device", "cpu", "--steps", "1"]
     with only_process(out, "trains"):
         assert cli.run("train", arguments) == 2
-    assert capsys.readouterr().err == (
-        f"gamba: {out}: another process trains here (pid {os.getpid()})\n"
-    )
+    said = f"gamba: {out}: another process trains here (pid {os.getpid()})\n"
+    assert capsys.readouterr().err == said
     assert os.listdir(out) == [".lock"]
     assert run(data, out, length={"steps": 1}) == 0
 

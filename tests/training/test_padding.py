@@ -27,18 +27,10 @@ def batch_of(config, boxes):
     many = (len(boxes), 3)
     seen = Cameras(views.viewmats.expand(*many, 4, 4), views.Ks.expand(*many, 3, 3), 16, 12)
     side = config.image_size
-    return with_foreground(
-        Batch(
-            [*"abcdefgh"[: len(boxes)]],
-            rgba,
-            cameras,
-            torch.rand(*many, 12, 16, 4),
-            seen,
-            torch.rand(len(boxes), 1, 3),
-            1.5 + torch.rand(len(boxes), 2, side, side),
-        ),
-        config,
-    )
+    targets, grounds = torch.rand(*many, 12, 16, 4), torch.rand(len(boxes), 1, 3)
+    surfaces = 1.5 + torch.rand(len(boxes), 2, side, side)
+    uids = [*"abcdefgh"[: len(boxes)]]
+    return with_foreground(Batch(uids, rgba, cameras, targets, seen, grounds, surfaces), config)
 
 
 @pytest.mark.parametrize(

@@ -90,20 +90,15 @@ def test_no_loss_inside_and_mean_over_all():
 
 def test_interpolates_between_rays():
     """Half-way between a ray at 0.2 and one at 0.6 the contour is 0.4."""
-    contours = torch.full((1, 8), 0.2)
-    contours[0, 1] = 0.6
-    loss = radial_mask_loss(mean_at(0.9, math.pi / 8), camera(), contours)
-    assert loss.item() == pytest.approx(0.25, rel=1e-4)  # float32 projection
-    last = torch.full((1, 8), 0.2)
-    last[0, 7] = 0.6  # the last ray and the first are neighbours too
-    loss = radial_mask_loss(mean_at(0.9, -math.pi / 8), camera(), last)
-    assert loss.item() == pytest.approx(0.25, rel=1e-4)
+    for ray, angle in ((1, math.pi / 8), (7, -math.pi / 8)):  # the last and the first, too
+        contours = torch.full((1, 8), 0.2)
+        contours[0, ray] = 0.6
+        loss = radial_mask_loss(mean_at(0.9, angle), camera(), contours)
+        assert loss.item() == pytest.approx(0.25, rel=1e-4)  # float32 projection
 
 
 def test_empty_mask_and_behind_the_camera_cost_nothing():
-    means = torch.cat(
-        [mean_at(0.9, 1.0), mean_at(0.9, 1.0, depth=-0.5), mean_at(0.9, 1.0, depth=0)]
-    )
+    means = torch.cat([mean_at(0.9, 1.0, depth=depth) for depth in (1.5, -0.5, 0)])
     means.requires_grad_()
     empty = radial_mask_loss(means, camera(), torch.zeros(1, 256))
     assert empty.item() == 0
@@ -127,9 +122,8 @@ def test_gradient_by_finite_differences():
     cameras = camera(views=3).to(torch.float64)
     turn = torch.tensor([[0.8, 0, 0.6], [0, 1, 0], [-0.6, 0, 0.8]], dtype=torch.float64)
     cameras.viewmats[1, :3, :3] = turn
-    cameras = Cameras(
-        cameras.viewmats.expand(2, 3, 4, 4), cameras.Ks.expand(2, 3, 3, 3), SIZE, SIZE
-    )
+    viewmats, Ks = (value.expand(2, *value.shape) for value in (cameras.viewmats, cameras.Ks))
+    cameras = Cameras(viewmats, Ks, SIZE, SIZE)
     contours = 0.1 + 0.2 * torch.rand(2, 3, 16, dtype=torch.float64, generator=generator)
     cotangent = torch.randn(2, 3, dtype=torch.float64, generator=generator)
 

@@ -55,9 +55,8 @@ def data(tmp_path_factory):
     root = micro.write_dataset(tmp_path_factory.mktemp("data") / "clouds", 3)
     for path in root.glob("*/transforms.json"):
         names = [frame["file_path"] for frame in json.loads(path.read_text())["frames"]]
-        path.with_name("orbit.json").write_text(
-            json.dumps({"distance": 1.8, "focal": 1.2, "images": names})
-        )
+        values = {"distance": 1.8, "focal": 1.2, "images": names}
+        path.with_name("orbit.json").write_text(json.dumps(values))
         path.unlink()
     return root
 
@@ -86,8 +85,8 @@ def test_the_example_trains_with_parts_of_each_kind(data, tables, tmp_path, scri
     assert got.encoder.network.convolution.weight.shape == fresh.shape
     assert "encoder.network.convolution.weight" in read_weights(out / "model.safetensors", got)
     restore(tables)
-    refused("model.safetensors: encoder patches: neither 'none'", load_model,
-            out / "model.safetensors")  # fmt: skip
+    said = "model.safetensors: encoder patches: neither 'none'"
+    refused(said, load_model, out / "model.safetensors")
     words = ["eval-views", "--checkpoint", out / "model.safetensors", "--data", data, "--json"]
     capsys.readouterr()
     assert script(*words, "--no-baselines", "--lpips", "off", "--split", "val") == 0
@@ -95,12 +94,11 @@ def test_the_example_trains_with_parts_of_each_kind(data, tables, tmp_path, scri
 
 
 def test_unknown_names_are_refused(tmp_path):
-    data = micro.write_dataset(tmp_path / "clouds")
-    refused("--schedule linear: expected one of cosine, trapezoid", run, data, tmp_path / "run",
-            optim={"schedule": "linear"})  # fmt: skip
-    model = (*micro.MODEL, "decoder=cloud")
-    refused("decoder is 'cloud', expected one of bins, rays, triplane", run, data,
-            tmp_path / "run", model)  # fmt: skip
+    data, out = micro.write_dataset(tmp_path / "clouds"), tmp_path / "run"
+    said = "--schedule linear: expected one of cosine, trapezoid"
+    refused(said, run, data, out, optim={"schedule": "linear"})
+    said = "decoder is 'cloud', expected one of bins, rays, triplane"
+    refused(said, run, data, out, (*micro.MODEL, "decoder=cloud"))
     assert not (tmp_path / "run").exists()
 
 

@@ -12,6 +12,7 @@ import sys
 import time
 from dataclasses import replace
 from types import SimpleNamespace
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -52,9 +53,25 @@ def on_forward(monkeypatch, change):
     monkeypatch.setattr(step, "forward", changed)
 
 
+def spoil(monkeypatch, factor):
+    """Multiply the loss of each step by ``factor(number)``."""
+
+    def multiply(number, result):
+        result.loss = result.loss * factor(number)
+
+    on_forward(monkeypatch, multiply)
+
+
 def stop_after(monkeypatch, count):
     """Send SIGTERM to this process in the middle of step ``count``."""
     on_forward(monkeypatch, lambda n, _: n == count and os.kill(os.getpid(), signal.SIGTERM))
+
+
+class Difference(torch.nn.Module):
+    """A stand-in for LPIPS."""
+
+    def forward(self, got, want):
+        return (got - want).abs().mean((-3, -2, -1))
 
 
 class Terminal(io.StringIO):
@@ -95,24 +112,15 @@ def test_lines_of_progress_are_seconds_apart(monkeypatch):
 
 def test_recomputation_changes_no_bit(data, tmp_path, monkeypatch):
     assert run(data, tmp_path / "plain") == 0
-    calls = []
-
-    def counting(*arguments, **options):
-        calls.append(1)
-        return checkpoint(*arguments, **options)
-
+    counting = Mock(wraps=checkpoint)
     monkeypatch.setattr("gamba_warp.model.parts.block.checkpoint", counting)
     assert run(data, tmp_path / "lean", run={"activation_checkpointing": True}) == 0
-    assert len(calls) == 6  # one block, six steps; none in validation
+    assert counting.call_count == 6  # one block, six steps; none in validation
     assert_same_files(tmp_path / "plain/model.safetensors", tmp_path / "lean/model.safetensors")
 
 
 @pytest.mark.parametrize("accumulate", [1, 2])
 def test_resume_is_bit_identical(data, tmp_path, monkeypatch, accumulate):
-    class Difference(torch.nn.Module):
-        def forward(self, got, want):
-            return (got - want).abs().mean((-3, -2, -1))
-
     monkeypatch.setattr(losses, "load_lpips", Difference)
     # The number of views changes at almost every step, so that one prepared too early would show.
     views = {"accumulate": accumulate, "background": "random", "views_per_object": None, "size": 20}
@@ -129,11 +137,8 @@ def test_resume_is_bit_identical(data, tmp_path, monkeypatch, accumulate):
         file = f"checkpoints/step_000006/{name}.safetensors"
         assert_same_files(tmp_path / "whole" / file, tmp_path / "parts" / file)
     assert_same_files(*(tmp_path / part / "model.safetensors" for part in ("whole", "parts")))
-    recorded = [
-        [record["loss"] for record in lines(tmp_path / part, "train")]
-        for part in ("whole", "parts")
-    ]
-    assert recorded[0] == recorded[1] and len(recorded[0]) == 6
+    whole, parts = (lines(tmp_path / part, "train") for part in ("whole", "parts"))
+    assert [r["loss"] for r in whole] == [r["loss"] for r in parts] and len(whole) == 6
     first, last = (f"checkpoints/step_00000{n}/model.safetensors" for n in (3, 6))
     assert not micro.same_weights(tmp_path / "parts" / first, tmp_path / "parts" / last)
 
@@ -185,9 +190,8 @@ def test_a_run_learns_and_writes_everything(tmp_path):
     assert records[-1]["psnr_grey_novel"] > 15 < records[-1]["psnr_black_input"]
     train_records = lines(tmp_path, "train")
     wanted = "loss loss_rgb loss_mask loss_rdist lr grad_norm views_per_second mean_alpha "
-    assert set((wanted + "visible_share spread psnr epoch skipped").split()) <= set(
-        train_records[0]
-    )
+    wanted += "visible_share spread psnr epoch skipped"
+    assert {*wanted.split()} <= {*train_records[0]}
     assert train_records[0]["loss"] > 2 * train_records[-1]["loss"]
     strip = np.asarray(Image.open(tmp_path / "samples" / "step_000120.png"))
     assert strip.shape == (2 * micro.SIZE, 5 * micro.SIZE, 3)
@@ -198,19 +202,13 @@ def test_a_run_learns_and_writes_everything(tmp_path):
 
 
 def test_validation_is_on_training_and_held_out_objects(data, tmp_path, monkeypatch):
-    seen = []
-    real = step.forward
-
-    def spy(model, batch, *arguments, **options):
-        seen.append((model.training, tuple(batch.uids)))
-        return real(model, batch, *arguments, **options)
-
-    for module in (step, validation):
-        monkeypatch.setattr(module, "forward", spy)
+    trained, validated = Mock(wraps=step.forward), Mock(wraps=step.forward)
+    monkeypatch.setattr(step, "forward", trained)
+    monkeypatch.setattr(validation, "forward", validated)
     assert run(data, tmp_path, length={"steps": 2}, run={"val_every": 1}) == 0
-    assert {uid for training, uids in seen if training for uid in uids} <= {"clouda", "cloudb"}
-    validated = [("clouda",), ("cloudb",), ("cloudc",)]
-    assert [uids for training, uids in seen if not training] == 2 * validated
+    uids = [[call.args[1].uids for call in each.call_args_list] for each in (trained, validated)]
+    assert {uid for batch in uids[0] for uid in batch} <= {"clouda", "cloudb"}
+    assert uids[1] == 2 * [["clouda"], ["cloudb"], ["cloudc"]]
 
 
 def test_a_validation_is_of_images_in_range(monkeypatch):
@@ -221,17 +219,13 @@ def test_a_validation_is_of_images_in_range(monkeypatch):
     batch = SimpleNamespace(targets=targets, cameras=front, to=lambda device: batch)
     result = SimpleNamespace(loss=torch.zeros(()), **shown, target=target, terms={})
     monkeypatch.setattr(validation, "forward", lambda *_: result)
-    figures, _ = validation.validate(
-        torch.nn.Identity(), [batch], step.Objective({}), torch.device("cpu")
-    )
+    given = torch.nn.Identity(), [batch], step.Objective({}), torch.device("cpu")
+    figures, _ = validation.validate(*given)
     assert figures["psnr_input"] == figures["psnr_novel"] == 100
 
 
 def test_non_finite_step_is_skipped_and_counted(data, tmp_path, monkeypatch, capsys):
-    def poison(number, result):
-        result.loss = result.loss * (math.nan if number == 3 else 1)
-
-    on_forward(monkeypatch, poison)
+    spoil(monkeypatch, lambda number: math.nan if number == 3 else 1)
     assert run(data, tmp_path, run={"save_every": 1}) == 0
     saved = [path / "model.safetensors" for path in list_checkpoints(tmp_path)]
     assert len(saved) == 6
@@ -244,10 +238,7 @@ def test_non_finite_step_is_skipped_and_counted(data, tmp_path, monkeypatch, cap
 
 
 def test_gives_up_after_many_non_finite_steps(data, tmp_path, monkeypatch):
-    def spoil(number, result):
-        result.loss = result.loss * math.inf
-
-    on_forward(monkeypatch, spoil)
+    spoil(monkeypatch, lambda number: math.inf)
     monkeypatch.setattr(loop, "MAX_SKIPPED", 3)
     refused("3 steps in a row were not finite", run, data, tmp_path)
 
@@ -302,8 +293,7 @@ def test_minutes_alone_limit_the_run(data, tmp_path, monkeypatch):
     assert 25 <= len(records) <= 30
     rates = [record["lr"] for record in records]
     # One step in 29 is left at the end of the cosine: 0.5 (1 + cos(28/29 π)) = 0.003.
-    assert rates[-1] < 0.02 * max(rates)
-    assert max(rates) > 0.9e-3
+    assert rates[-1] < 0.02 * max(rates) and max(rates) > 0.9e-3
     saving = {"run": {"save_every": 99, "save_minutes": 0.1}}  # six readings
     assert run(data, tmp_path / "saving", length={"steps": 20}, **saving) == 0
     steps = [int(path.name[5:]) for path in list_checkpoints(tmp_path / "saving")]
@@ -341,9 +331,9 @@ def test_lpips_is_real_or_absent(data, tmp_path, monkeypatch):
     chosen = replace(config, loss=replace(config.loss, lpips="on"))
     assert losses.open_lpips(crop, "cpu") == losses.open_lpips(chosen, "cpu") == ("real", None)
 
-    class Half(torch.nn.Module):
+    class Half(Difference):
         def forward(self, got, want):
-            return (got - want).abs().mean((-3, -2, -1)) * 0 + 0.5
+            return super().forward(got, want) * 0 + 0.5
 
     monkeypatch.setattr(losses, "load_lpips", Half)
     loss = {"lpips": "on", "lpips_weight": 3.0, "lpips_after": 2, "radial_mask": False}
@@ -396,11 +386,7 @@ def test_auto_is_the_precision_that_the_trial_finds(data, tmp_path, monkeypatch,
 
 
 def test_slow_bfloat16_is_said(data, tmp_path, monkeypatch, capsys):
-    for gain, name, said in (
-        (0.25, "bfloat16", True),
-        (1.5, "bfloat16", False),
-        (0.25, "float32", 0),
-    ):
+    for gain, name, said in ((0.25, "bfloat16", 1), (1.5, "bfloat16", 0), (0.25, "float32", 0)):
         monkeypatch.setattr("gamba_warp.devices._bfloat16_speedup", lambda *_, gain=gain: gain)
         out = tmp_path / f"{name} {gain}"
         assert run(data, out, optim={"precision": name}, length={"steps": 1}) == 0
