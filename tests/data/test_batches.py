@@ -3,7 +3,8 @@
 import threading
 import time
 from concurrent.futures import CancelledError
-from contextlib import nullcontext, suppress
+from contextlib import closing, nullcontext, suppress
+from unittest.mock import DEFAULT, Mock
 
 import pytest
 import torch
@@ -43,10 +44,9 @@ def test_the_queue_gives_the_batches_of_the_source(data, workers):
     def novel(number):
         return number % 3  # differs between batches, so that a mix-up would show
 
-    ahead = batches_of(data, workers=workers, novel=novel, last=7)
-    for number in range(7):
-        same(ahead.take(number), take(batches_of(data, novel=novel), number))
-    ahead.close()
+    with closing(batches_of(data, workers=workers, novel=novel, last=7)) as ahead:
+        for number in range(7):
+            same(ahead.take(number), take(batches_of(data, novel=novel), number))
 
 
 def test_a_mirrored_sample_keeps_its_views_and_its_background(data):
@@ -95,27 +95,19 @@ def test_an_error_is_raised_in_its_step(data, workers, monkeypatch):
         return real(dataset, index, *rest)
 
     monkeypatch.setattr(batches, "load_sample", load)
-    made = batches_of(data, 1, workers)
-    assert made.take(0).uids == order[:1] and not made.failures
-    refused(r"^3 of 5 objects cannot be read; the last: cloud.: spoilt", made.take, 1)
-    made.close()
+    with closing(batches_of(data, 1, workers)) as made:
+        assert made.take(0).uids == order[:1] and not made.failures
+        refused(r"^3 of 5 objects cannot be read; the last: cloud.: spoilt", made.take, 1)
 
 
 def test_a_defect_of_the_program_is_raised_in_its_step(data, monkeypatch):
-    real, calls = batches.load_sample, []
-
-    def load(*arguments):
-        calls.append(1)
-        if len(calls) == 3:
-            raise KeyError("defect")
-        return real(*arguments)
-
+    outcomes = [DEFAULT, DEFAULT, KeyError("defect"), DEFAULT]
+    load = Mock(wraps=batches.load_sample, side_effect=outcomes)
     monkeypatch.setattr(batches, "load_sample", load)
-    made = batches_of(data, 2)
-    made.take(0)
-    with pytest.raises(KeyError, match="defect"):
-        made.take(1)
-    made.close()
+    with closing(batches_of(data, 2)) as made:
+        made.take(0)
+        with pytest.raises(KeyError, match="defect"):
+            made.take(1)
 
 
 def test_closing_waits_for_one_sample_of_each_thread(data):
@@ -172,16 +164,14 @@ def test_a_gpu_gets_pinned_batches(data, monkeypatch):
     monkeypatch.setattr(torch.cuda, "stream", lambda stream: nullcontext())
     monkeypatch.setattr(torch.cuda, "current_stream", lambda device: steps)
     monkeypatch.setattr(torch.Tensor, "record_stream", lambda t, s: kept.append((t.shape, s)))
-    made = batches_of(data, world=World(0, 1, GPU), novel=lambda _: 1, last=1)
-    batch = made.take(0)
-    made.close()
+    with closing(batches_of(data, world=World(0, 1, GPU), novel=lambda _: 1, last=1)) as made:
+        batch = made.take(0)
     tensors = (batch.inputs, batch.targets, batch.background, batch.cameras.Ks)
     assert all(tensor.shape in asked for tensor in tensors)
     assert len(asked) == len(moved) == 7 and all(moved)
     assert copies.said == ["recorded"] and steps.said == ["waits for copies"]
     assert len(kept) == 7 and {stream for _, stream in kept} == {steps}
     asked.clear()
-    made = batches_of(data, last=1)
-    made.take(0)
-    made.close()
+    with closing(batches_of(data, last=1)) as made:
+        made.take(0)
     assert not asked, "the CPU's way is left alone"

@@ -90,9 +90,7 @@ def test_package_to_views(tmp_path):
 
     assert render_views(out, tmp_path / "data", views=1, size=16, workers=1) == 0
     assert len(open_dataset(tmp_path / "data", split_of(meshes[0].group))) == 2
-    assert (
-        data_furniture_command(out, tree=library.parent) == 0
-    )  # again, from the other kind of source
+    assert data_furniture_command(out, tree=library.parent) == 0  # the other kind of source
     assert json.loads((out / "catalogue.json").read_text())["objects"] == entries
 
 
@@ -174,10 +172,10 @@ def test_hostile_libraries_leave_nothing_behind(tmp_path, properties, more, reas
 
 def groups(*items):
     """Groups of objects "library/name/textures", as sets of their numbers."""
-    named = [
-        ObjectInfo(str(i), *item.split("/")[:2], frozenset(item.split("/")[2:]))
-        for i, item in enumerate(items)
-    ]
+    named = []
+    for number, item in enumerate(items):
+        library, name, *textures = item.split("/")
+        named.append(ObjectInfo(str(number), library, name, frozenset(textures)))
     found = split_groups(named)
     sides = {name: {uid for uid in found if found[uid] == name} for name in found.values()}
     return sorted("".join(sorted(uids)) for uids in sides.values()), found
@@ -206,9 +204,8 @@ def test_names_that_begin_alike_meet_in_one_library():
 
 
 def test_shared_textures_meet_and_pass_it_on():
-    sides, found = groups(
-        "A/Oak desk/x", "B/Pine bed/x/y", "C/Small crate/y", "C/Wine crate", "D/Lamp/z"
-    )
+    items = ("A/Oak desk/x", "B/Pine bed/x/y", "C/Small crate/y", "C/Wine crate", "D/Lamp/z")
+    sides, found = groups(*items)
     assert sides == ["0123", "4"]
     assert found["0"] == "C-crate"  # the most frequent name
 

@@ -60,18 +60,16 @@ def test_views_are_neither_empty_nor_cropped():
 def test_geometry_lies_in_the_views_frame(uid):
     """Open3D's pinhole camera projects the stored mesh onto the stored images."""
     o3d = import_open3d()
+    tensor = o3d.core.Tensor
     mesh = trimesh.load_mesh(STARTER / "meshes" / f"{uid}.ply")
     assert np.ptp(mesh.vertices, axis=0).max() == pytest.approx(1, abs=1e-5)
     scene = o3d.t.geometry.RaycastingScene(nthreads=1)
-    scene.add_triangles(
-        o3d.core.Tensor(mesh.vertices.astype(np.float32)),
-        o3d.core.Tensor(mesh.faces.astype(np.uint32)),
-    )
+    vertices, faces = mesh.vertices.astype(np.float32), mesh.faces.astype(np.uint32)
+    scene.add_triangles(tensor(vertices), tensor(faces))
     views = open_dataset(STARTER / "data").load(uid, views=[0, 11])
     for image, viewmat, K in zip(views.images, views.cameras.viewmats, views.cameras.Ks):
-        rays = scene.create_rays_pinhole(
-            o3d.core.Tensor(K.double().numpy()), o3d.core.Tensor(viewmat.double().numpy()), 128, 128
-        )
+        camera = tensor(K.double().numpy()), tensor(viewmat.double().numpy())
+        rays = scene.create_rays_pinhole(*camera, 128, 128)
         hit = np.isfinite(scene.cast_rays(rays, nthreads=1)["t_hit"].numpy())
         shown = image[..., 3].numpy() > 0.5
         # pixels on the outline may fall either way: up to 4 % of thin-legged objects

@@ -49,11 +49,9 @@ def write_transforms(folder, count=3, suffix=".png", width=14, height=10, depth=
         write_image(folder / name, width, height, mark=i)
         frames.append({"file_path": name, "transform_matrix": poses[i]})
         if depth:
-            frames[-1]["depth_file_path"] = f"depth/{i}.png"
+            frames[-1]["depth_file_path"] = name = f"depth/{i}.png"
             (folder / "depth").mkdir(exist_ok=True)
-            Image.fromarray(np.full((height, width), 1000 + i, np.uint16)).save(
-                folder / f"depth/{i}.png"
-            )
+            Image.fromarray(np.full((height, width), 1000 + i, np.uint16)).save(folder / name)
     values = {"w": width, "h": height, "fl_x": FOCAL * height, "fl_y": FOCAL * height}
     values |= {"cx": width / 2, "cy": height / 2, "depth_unit": 1e-3, "frames": frames}
     values |= {"name": "Red half", "attribution": {"creator": "somebody"}}
@@ -62,9 +60,7 @@ def write_transforms(folder, count=3, suffix=".png", width=14, height=10, depth=
 
 
 def edit(path, **changes):
-    values = json.loads(path.read_text())
-    values.update(changes)
-    path.write_text(json.dumps(values))
+    path.write_text(json.dumps(json.loads(path.read_text()) | changes))
 
 
 def test_transforms_layout(tmp_path):
@@ -138,17 +134,16 @@ def test_an_angle_alone_of_a_image_that_is_not_square(tmp_path):
     """Pixels are square: the vertical focal length is the horizontal one, in pixels."""
     path = write_transforms(tmp_path, count=1, width=8, height=6)
     frame = json.loads(path.read_text())["frames"][0]
-    path.write_text(json.dumps({"camera_angle_x": FOV, "frames": [frame]}))
-    K = open_dataset(tmp_path).load(0).cameras.Ks[0]
-    torch.testing.assert_close(K, torch.tensor([[FOCAL * 8, 0, 4], [0, FOCAL * 8, 3], [0, 0, 1]]))
-    angles = {"camera_angle_x": FOV, "camera_angle_y": 2 * FOV, "frames": [frame]}
-    path.write_text(json.dumps(angles))
-    K = open_dataset(tmp_path).load(0).cameras.Ks[0]
-    assert K[1, 1] == pytest.approx(3 / math.tan(FOV))
-    # Numbers in pixels apply to the image, whose size the file need not repeat.
-    path.write_text(json.dumps({"fl_x": 9, "fl_y": 7, "cx": 3, "cy": 2, "frames": [frame]}))
-    K = open_dataset(tmp_path).load(0).cameras.Ks[0]
-    assert K.tolist() == [[9, 0, 3], [0, 7, 2], [0, 0, 1]]
+    for given, (fl_x, fl_y, cx, cy) in (
+        ({"camera_angle_x": FOV}, (FOCAL * 8, FOCAL * 8, 4, 3)),
+        ({"camera_angle_x": FOV, "camera_angle_y": 2 * FOV}, (FOCAL * 8, 3 / math.tan(FOV), 4, 3)),
+        # Numbers in pixels apply to the image, whose size the file need not repeat.
+        ({"fl_x": 9, "fl_y": 7, "cx": 3, "cy": 2}, (9, 7, 3, 2)),
+    ):
+        path.write_text(json.dumps({**given, "frames": [frame]}))
+        K = open_dataset(tmp_path).load(0).cameras.Ks[0]
+        want = torch.tensor([[fl_x, 0, cx], [0, fl_y, cy], [0, 0, 1]]).float()
+        torch.testing.assert_close(K, want)
 
 
 def test_gobjaverse_of_images_that_are_not_square(tmp_path):

@@ -87,10 +87,8 @@ def test_a_whole_step_rounds_in_the_network_alone(cameras, tmp_path, monkeypatch
     from gamba_warp.train.step import Objective, compute_gradients, health
 
     cloud = cloud_of(2)
-    targets = torch.rand(1, 5, 13, 17, 4)
-    batch = Batch(
-        ["a"], torch.rand(1, 8, 8, 3), cameras[:1], targets, cameras[None], torch.ones(1, 1, 3)
-    )
+    inputs, targets = torch.rand(1, 8, 8, 3), torch.rand(1, 5, 13, 17, 4)
+    batch = Batch(["a"], inputs, cameras[:1], targets, cameras[None], torch.ones(1, 1, 3))
     weights = {"rgb": 1.0, "mask": 1.0, "ssim": 0.2, "lpips": 0.0, "rdist": 0.1}
     optimizer = torch.optim.SGD([cloud.means], lr=0.1)
     with Products() as seen:

@@ -101,8 +101,8 @@ def test_files_hold_the_objects(tmp_path, objects):
         read, made = load_mesh(mesh.path), objects[number]
         assert not read.warnings and len(read.faces) == len(made.faces)
         # float32 in the file
-        assert np.allclose(read.vertices.min(0), made.vertices.min(0), atol=1e-5)
-        assert np.allclose(read.vertices.max(0), made.vertices.max(0), atol=1e-5)
+        ends, others = ([v.min(0), v.max(0)] for v in (read.vertices, made.vertices))
+        assert np.allclose(ends, others, atol=1e-5)
         names = [look.texture is not None for look in read.materials]
         used = [made.materials[i].texture is not None for i in np.unique(made.material_ids)]
         assert sorted(names) == sorted(used)
@@ -117,8 +117,6 @@ def test_another_catalogue_is_not_overwritten(tmp_path):
 
 @pytest.mark.parametrize("options", [{"count": 0}, {"count": 100_001}, {"count": 1, "seed": -1}])
 def test_absurd_options_are_refused(tmp_path, options):
-    name = [*options][-1]
-    refused(
-        f"--{name} {options[name]}: must be", data_procedural_command, tmp_path / "out", **options
-    )
+    name, value = [*options.items()][-1]
+    refused(f"--{name} {value}: must be", data_procedural_command, tmp_path / "out", **options)
     assert not (tmp_path / "out").exists()

@@ -38,9 +38,8 @@ def write_object(folder, seed, depth=None):
     folder.mkdir(parents=True)
     frames = []
     for v in range(VIEWS):
-        Image.fromarray(rng.integers(0, 256, (HEIGHT, WIDTH, 4), np.uint8)).save(
-            folder / f"{v}.png"
-        )
+        image = Image.fromarray(rng.integers(0, 256, (HEIGHT, WIDTH, 4), np.uint8))
+        image.save(folder / f"{v}.png")
         viewmat = orbit(torch.tensor([37.0 * v + seed]), 10.0 + v, 1.7)[0].double()
         frame = {"file_path": f"{v}.png", "transform_matrix": to_opengl(viewmat).tolist()}
         frame |= {"w": WIDTH, "h": HEIGHT, "fl_x": 11.3 + v, "cx": 6.7, "cy": 5.1}
@@ -92,10 +91,8 @@ def assert_same(got, want):
 
 @pytest.mark.parametrize("size", [6, 10, None])
 def test_shards_give_the_bits_of_the_files(data, tmp_path, size):
-    assert packed(data, tmp_path / "pack", size, 1000, 2) == {
-        "train-00000.tar": 2,
-        "test-00000.tar": 1,
-    }
+    counts = packed(data, tmp_path / "pack", size, 1000, 2)
+    assert counts == {"train-00000.tar": 2, "test-00000.tar": 1}
     files, (uids, load) = open_dataset(data), opened(tmp_path / "pack")
     assert uids == files.uids
     for uid in uids:
@@ -197,26 +194,25 @@ def changed(suffix, content):
     return change
 
 
-def in_document(change):
-    def changed_document(content):
-        values = json.loads(content)
-        change(values)
-        return json.dumps(values).encode()
+def in_frame(**values):
+    """Change the first frame of the object's document."""
 
-    return changed("json", changed_document)
+    def change(content):
+        document = json.loads(content)
+        document["frames"][0] |= values
+        return json.dumps(document).encode()
+
+    return changed("json", change)
 
 
 @pytest.mark.parametrize(
     "change, reason",
     [
         (changed("json", b"{"), "not valid JSON"),
-        (in_document(lambda top: top["frames"][0].update(file_path="../a/0.png")), "has no"),
-        (in_document(lambda top: top["frames"][0].update(file_path=3)), "no file_path"),
-        (in_document(lambda top: top["frames"][0].update(file_path="json")), "has no 'json'"),
-        (
-            in_document(lambda top: top["frames"][0].update(transform_matrix=[[7] * 4] * 4)),
-            "not a rotation",
-        ),
+        (in_frame(file_path="../a/0.png"), "has no"),
+        (in_frame(file_path=3), "no file_path"),
+        (in_frame(file_path="json"), "has no 'json'"),
+        (in_frame(transform_matrix=[[7] * 4] * 4), "not a rotation"),
         (changed("000.png", bytes_of(Image.new("1", (20000, 20000)))), "megapixels"),
         (changed("000.png", b"no image"), "a.000.png: "),
         (lambda all: [m for m in all if m[0].name != "a.json"], "not valid JSON"),

@@ -10,7 +10,6 @@ from helpers.meshes import render_views
 from helpers.refusals import refused
 
 from gamba_warp.data.dataset import open_dataset, split_of
-from gamba_warp.errors import UserError
 from gamba_warp.formats.meshes import load_mesh
 from gamba_warp.train.data.poses import FRONT, front_views, look_at_origin, sample_poses
 from gamba_warp.train.data.raycast import Lights
@@ -27,31 +26,24 @@ def boxes(tmp_path):
     return tmp_path / "meshes"
 
 
-def cameras_of(folder, uid):
-    return json.loads((folder / uid / "transforms.json").read_text())
-
-
 def test_stretch_and_field_of_view_are_drawn_for_each_object_and_stated(boxes, tmp_path):
     out = tmp_path / "data"
     render_views(boxes, out, stretch=1.5, fov_spread=1.3, depth=True, **QUICK)
-    found = [cameras_of(out, uid) for uid in ("a", "b")]
-    half = 17 / 2
-    angles = [2 * np.degrees(np.arctan(half / one["fl_x"])) for one in found]
+    found = [json.loads((out / uid / "transforms.json").read_text()) for uid in ("a", "b")]
+    angles = [2 * np.degrees(np.arctan(17 / 2 / one["fl_x"])) for one in found]
     assert all(49.1 / 1.3 <= angle <= 49.1 * 1.3 for angle in angles) and angles[0] != angles[1]
-    for values in found:
+    for uid, values in zip(("a", "b"), found):
         # A box stretched along its own axes has the sides of the transform.
         turn = np.array(values["applied_transform"])[:, :3] * values["applied_scale"]
         sides = np.abs(turn @ np.diag([1.0, 0.2, 0.5])).sum(1)
         assert sides.max() == pytest.approx(1)
         factors = np.diag(turn) / values["applied_scale"]
         assert ((factors >= 1 / 1.5) & (factors <= 1.5)).all() and np.ptp(factors) > 0.01
-    # The depth at the middle of a view ends on the stretched box's surface.
-    views = open_dataset(out).load("a")
-    turn = np.array(found[0]["applied_transform"])[:, :3] * found[0]["applied_scale"]
-    sides = np.abs(turn @ np.diag([1.0, 0.2, 0.5])).sum(1) / 2
-    for depth, viewmat in zip(views.depths.double(), views.cameras.viewmats.double()):
-        point = (torch.tensor([0, 0, depth[8, 8]]).double() - viewmat[:3, 3]) @ viewmat[:3, :3]
-        assert (point.abs().numpy() / sides).max() == pytest.approx(1, abs=2e-3)
+        # The depth at the middle of a view ends on the stretched box's surface.
+        views = open_dataset(out).load(uid)
+        for depth, viewmat in zip(views.depths.double(), views.cameras.viewmats.double()):
+            point = (torch.tensor([0, 0, depth[8, 8]]).double() - viewmat[:3, 3]) @ viewmat[:3, :3]
+            assert (point.abs().numpy() / sides).max() == pytest.approx(0.5, abs=1e-3)
 
 
 def test_without_the_new_options_nothing_changes_and_older_sets_go_on(boxes, tmp_path, capsys):
@@ -78,16 +70,15 @@ def test_only_the_objects_of_one_part(tmp_path):
         trimesh.creation.box().export(tmp_path / "meshes" / f"{name}.ply")
     wanted = sorted(name for name in names if split_of(name) == "train")
     assert 0 < len(wanted) < 12
-    render_views(
-        *(tmp_path / "meshes", tmp_path / "data"), views=1, size=8, workers=1, split="train"
-    )
-    assert open_dataset(tmp_path / "data").uids == wanted
+    out = tmp_path / "data"
+    render_views(tmp_path / "meshes", out, views=1, size=8, workers=1, split="train")
+    assert open_dataset(out).uids == wanted
 
 
 def test_fields_of_view_that_no_camera_has_are_refused(boxes, tmp_path):
-    for options in ({"fov": 100.0, "fov_spread": 1.3}, {"fov": 6.0, "fov_spread": 1.3}):
-        with pytest.raises(UserError, match="--fov-spread 1.3: makes fields of view outside"):
-            render_views(boxes, tmp_path / "data", **options)
+    said = "--fov-spread 1.3: makes fields of view outside"
+    for fov in (100.0, 6.0):
+        refused(said, render_views, boxes, tmp_path / "data", fov=fov, fov_spread=1.3)
     assert not (tmp_path / "data").exists()
 
 
