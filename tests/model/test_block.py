@@ -6,7 +6,7 @@ import pytest
 import torch
 from helpers import assert_rel_rms
 from helpers.mamba import TRANSITIONS, gamba_block_in_float64
-from helpers.model import assert_plain_form, inputs, micro, moved_blocks, perturbed
+from helpers.model import FIELDS, assert_plain_form, inputs, micro, moved_blocks, perturbed
 
 from gamba_warp.model.config import GambaConfig
 from gamba_warp.model.gamba import Gamba
@@ -134,12 +134,11 @@ def test_full_depth_model_equals_prepend_and_drop():
     config = micro(image_size=32, patch_size=4, width=48, depth=14, state_size=16)
     model = Gamba(config, "random")
     images, cameras = inputs(2, 32)
-    names = ("means", "scales", "opacities", "colors")
     cotangents = [torch.randn(2, 256, *s) for s in ((3,), (3,), (), (3,))]
     parameters = {n: p for n, p in model.named_parameters() if p.requires_grad}
 
     def gradients(gaussians):
-        loss = sum((getattr(gaussians, n) * c).sum() for n, c in zip(names, cotangents))
+        loss = sum((getattr(gaussians, n) * c).sum() for n, c in zip(FIELDS, cotangents))
         return dict(zip(parameters, torch.autograd.grad(loss, list(parameters.values()))))
 
     condition = model.camera_token(cameras), model.encoder(images)
@@ -147,7 +146,7 @@ def test_full_depth_model_equals_prepend_and_drop():
     want = model.decoder(model.norm(tokens))
     got = model(images, cameras)
     # Float32 rounding, through 14 blocks.
-    for name in names:
+    for name in FIELDS:
         assert_rel_rms(getattr(got, name), getattr(want, name), 2e-6, name)
     wanted, gotten = gradients(want), gradients(got)
     for name, grad in wanted.items():

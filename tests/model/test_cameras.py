@@ -2,19 +2,20 @@
 
 import math
 from dataclasses import replace
+from unittest.mock import Mock
 
 import pytest
 import torch
 from helpers.gaussians import some
 from helpers.micro import write_dataset
 from helpers.model import SMALLEST
+from helpers.refusals import refused
 from helpers.views import to_opengl
 from torch.testing import assert_close
 
 from gamba_warp import cameras as C
 from gamba_warp.cameras import Cameras, intrinsics, orbit, reference_viewmat, view_angles
 from gamba_warp.data.dataset import open_dataset
-from gamba_warp.errors import UserError
 from gamba_warp.eval.views.compare import ViewsProtocol, load_gt
 from gamba_warp.eval.views.options import ViewsOptions
 from gamba_warp.eval.views.predictions import ModelPredictions, open_predictions
@@ -70,9 +71,8 @@ def test_opengl_bridge():
     assert_close(C.from_opengl(poses), viewmats)
     # The pose's axes in the world: x right, y up, z backward; its last column is the position.
     rotation = viewmats[..., :3, :3]
-    assert_close(poses[..., :3, 0], rotation[..., 0, :])
-    assert_close(poses[..., :3, 1], -rotation[..., 1, :])
-    assert_close(poses[..., :3, 2], -rotation[..., 2, :])
+    signs = torch.tensor([1.0, -1.0, -1.0]).double()
+    assert_close(poses[..., :3, :3], rotation.mT * signs)
     centre = torch.cat([poses[..., :3, 3], torch.ones(5, 2, 1)], -1)[..., None].double()
     origin = torch.tensor([0.0, 0, 0, 1]).expand(5, 2, 4).double()
     assert_close((viewmats @ centre)[..., 0], origin)
@@ -206,17 +206,12 @@ def test_training_and_evaluation_see_the_same_input(dataset, tmp_path, monkeypat
     save_model(tmp_path / "model" / "model.safetensors", Gamba(CONFIG))
     options = ViewsOptions(checkpoint=tmp_path / "model", data=tmp_path)
     predictions = ModelPredictions(options, "cpu")
-    seen = []
-    run = predictions.model.forward
-
-    def noted(*inputs, **options):
-        seen.append(inputs)
-        return run(*inputs, **options)
-
-    monkeypatch.setattr(predictions.model, "forward", noted)
+    forward = Mock(wraps=predictions.model.forward)
+    monkeypatch.setattr(predictions.model, "forward", forward)
     predictions.gaussians(dataset, uid, 4)
-    assert torch.equal(seen[0][0], want[0]) and torch.equal(seen[0][1].Ks, want[1].Ks)
-    assert torch.equal(seen[0][1].viewmats, want[1].viewmats)
+    images, cameras, *_ = forward.call_args.args
+    assert torch.equal(images, want[0]) and torch.equal(cameras.Ks, want[1].Ks)
+    assert torch.equal(cameras.viewmats, want[1].viewmats)
 
     protocol = ViewsProtocol("all", 4, None, None, None, None, predictions.distance)
     gt = load_gt(dataset, uid, protocol, "cpu")
@@ -236,5 +231,5 @@ def test_an_evaluation_states_the_precision_of_its_model(dataset, tmp_path):
     assert 0 < (made["bfloat16"] - made["float32"]).abs().max() < 0.02
     (tmp_path / "plys").mkdir()
     save_ply(tmp_path / "plys" / "a.ply", some(3))
-    with pytest.raises(UserError, match="--precision: .*plys holds no model"):
-        open_predictions(replace(options, checkpoint=tmp_path / "plys"), "cpu")
+    options = replace(options, checkpoint=tmp_path / "plys")
+    refused("--precision: .*plys holds no model", open_predictions, options, "cpu")

@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from helpers.model import micro, quick, run_reconstruct
+from helpers.model import FIELDS, micro, quick, run_reconstruct
 from helpers.refusals import refused
 from scipy.ndimage import minimum_filter
 
@@ -31,8 +31,6 @@ from gamba_warp.model.gamba import Gamba
 from gamba_warp.model.posing import reference_cameras
 from gamba_warp.model.predict import model_input, reconstruct
 from gamba_warp.render import render
-
-FIELDS = ("means", "scales", "opacities", "colors")
 
 
 def rays(**changes) -> GambaConfig:
@@ -174,10 +172,8 @@ def test_no_crack_opens_from_the_side():
     model = load_model()
     viewmats = orbit(torch.tensor([60.0, 90.0, -90.0]))
     cameras = Cameras(viewmats, intrinsics(256, 256).expand(3, 3, 3), 256, 256)
-    before, after = (
-        render(reconstruct(model, rgba, detail=k), cameras).alpha[..., 0] for k in (1, 4)
-    )
-    for one, other in zip(before, after):
+    made = (render(reconstruct(model, rgba, detail=k), cameras).alpha[..., 0] for k in (1, 4))
+    for one, other in zip(*made):
         full = one > 0.95
         assert full.sum() > 5000
         # One pixel in two thousand may lose a tenth of its alpha; cracks would be whole lines.
@@ -195,9 +191,8 @@ def test_children_go_half_of_the_way_that_parents_lie_off_their_rays():
             made.means[:, 0] += off
             split = split_front(made, image[0], rgba, model.config, 2, camera)
             found.append(split.means[-200:])
-    torch.testing.assert_close(
-        found[1] - found[0], torch.tensor([0.002, 0.0, 0.0]).expand(200, 3), atol=1e-6, rtol=0
-    )
+    want = torch.tensor([0.002, 0.0, 0.0]).expand(200, 3)
+    torch.testing.assert_close(found[1] - found[0], want, atol=1e-6, rtol=0)
 
 
 def test_children_lie_on_the_rays_of_their_own_pixels(monkeypatch):
@@ -215,9 +210,8 @@ def test_children_lie_on_the_rays_of_their_own_pixels(monkeypatch):
     assert len(pixels.round(decimals=2).unique(dim=0)) == 200  # and each has its own pixel
     # Half as wide across the view as their parents, and as long along it.
     parents = whole.scales[::3].mean(0)
-    torch.testing.assert_close(
-        children.scales.mean(0) / parents, torch.tensor([0.5, 0.5, 1.0]), rtol=0.02, atol=0
-    )
+    ratio = children.scales.mean(0) / parents
+    torch.testing.assert_close(ratio, torch.tensor([0.5, 0.5, 1.0]), rtol=0.02, atol=0)
     # Children of small parents are still wide enough to cover the image.
     model.decoder.scale_bias.data[0] = math.log(0.1)
     small = reconstruct(model, rgba, detail=2).scales[-200:]
@@ -234,10 +228,9 @@ def test_a_cell_counts_as_much_as_its_alpha():
     moved = replace(before, means=before.means * torch.where(faint, 1.2, 1.0)[:, None])
     moved.means[faint, 2] += 0.3
     about = image, rgba, model.config, 2, reference_cameras(model.config, 1)
-    depths = [
-        each.means[(each.means[:, 0] < -0.01) & (each.scales[:, 0] < 0.013), 2]
-        for each in (split_front(one, *about) for one in (before, moved))
-    ]
+    depths = []
+    for each in (split_front(one, *about) for one in (before, moved)):
+        depths.append(each.means[(each.means[:, 0] < -0.01) & (each.scales[:, 0] < 0.013), 2])
     assert len(depths[0]) == len(depths[1]) > 500
     assert (depths[1] - depths[0]).abs().max() < 0.02
 
@@ -327,8 +320,8 @@ def test_other_decoders_and_other_numbers_are_refused():
     torch.manual_seed(1)
     bins = Gamba(micro(encoder="none")).eval()
     rgba = board(96, 4)
-    refused("detail 2 needs a model with the decoder rays, and this one has bins", reconstruct,
-            bins, rgba, detail=2)  # fmt: skip
+    said = "detail 2 needs a model with the decoder rays, and this one has bins"
+    refused(said, reconstruct, bins, rgba, detail=2)
     assert same(reconstruct(bins, rgba), reconstruct(bins, rgba, detail=1))
     refused("detail is 3, it must be 1, 2 or 4", reconstruct, fresh(), rgba, detail=3)
 

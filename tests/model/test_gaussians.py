@@ -16,9 +16,8 @@ def batch(*lead, n=5, rotated=True):
     def rand(*size):
         return torch.rand(*lead, n, *size)
 
-    return Gaussians(
-        rand(3), torch.randn(*lead, n, 4) if rotated else None, rand(3), rand(), rand(3)
-    )
+    quats = torch.randn(*lead, n, 4) if rotated else None
+    return Gaussians(rand(3), quats, rand(3), rand(), rand(3))
 
 
 @pytest.mark.parametrize("name", ["means", "quats", "scales", "colors"])

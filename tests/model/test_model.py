@@ -58,13 +58,10 @@ def test_segments_change_nothing(monkeypatch):
     images, cameras = inputs(2)
     want = model(images, cameras)  # with a gradient: in one piece
     calls = []
-    hook = model.blocks[0].register_forward_hook(
-        lambda _, args, out: calls.append(args[0].shape[1])
-    )
+    model.blocks[0].register_forward_hook(lambda _, args, out: calls.append(args[0].shape[1]))
     monkeypatch.setattr("gamba_warp.model.parts.block.SEGMENT", 16)
     with torch.no_grad():
         got = model(images, cameras)
-    hook.remove()
     assert calls == [16, 16, 4]
     # Matrix products of another size sum in another order.
     assert_rel_rms(got.means, want.means, 1e-6, "means")
@@ -205,11 +202,7 @@ def test_a_default_of_float64_changes_nothing(changes):
 @pytest.fixture(scope="module")
 def shallow():
     torch.manual_seed(0)
-    config = GambaConfig(
-        image_size=32, patch_size=4, width=16, depth=2, state_size=4, encoder="none",
-        encoder_size=32,
-    )  # fmt: skip
-    return Gamba(config).eval()
+    return Gamba(micro(image_size=32, encoder="none")).eval()
 
 
 def dotted(*squares):

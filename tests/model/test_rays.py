@@ -18,8 +18,6 @@ from gamba_warp.model.parts.rays import RayDecoder
 from gamba_warp.model.predict import model_input, reconstruct
 from gamba_warp.render import render
 
-FIELDS = ("means", "scales", "opacities", "colors")
-
 
 def rays(**changes) -> GambaConfig:
     """A micro configuration with 2 x 2 cells a patch and 3 layers, without an encoder."""
@@ -87,10 +85,8 @@ def test_the_stem_sees_the_own_rows_and_columns_as_the_whole(cells):
     want = decoder.stem(pixels).permute(0, 2, 3, 1)[image, row, column]
     assert seen.counts[1] == 0 and sum(seen.counts) == len(got)
     torch.testing.assert_close(got, want, rtol=1e-5, atol=1e-6)
-    grads = [
-        torch.autograd.grad(made.square().sum(), list(decoder.stem.parameters()))
-        for made in (got, want)
-    ]
+    weights = list(decoder.stem.parameters())
+    grads = (torch.autograd.grad(made.square().sum(), weights) for made in (got, want))
     for ours, theirs in zip(*grads):
         torch.testing.assert_close(ours, theirs, rtol=1e-4, atol=1e-5)
     assert seen.boxes == [(5, 4, 9, 8), (0, 0, 4, 4), (2, 0, 10, 10)]
@@ -225,9 +221,7 @@ def test_an_empty_image_has_no_gaussians_and_may_stand_in_a_batch():
     assert made.num == 0
     views = Cameras(cameras.viewmats[:1, None], cameras.Ks[:1, None], 12, 12)
     assert render(made, views, torch.ones(3)).rgb.eq(1).all()
-    made = model(
-        torch.cat([empty, rgba[:1]]), Cameras(cameras.viewmats[:2], cameras.Ks[:2], 12, 12)
-    )
+    made = model(torch.cat([empty, rgba[:1]]), cameras[:2])
     assert made.opacities[0].eq(0).all() and made.opacities[1].max() > 0.1
     sum(value.sum() for value in (made.means, made.colors, made.scales)).backward()
     assert all(p.grad is None or p.grad.isfinite().all() for p in model.parameters())

@@ -36,9 +36,7 @@ def gamba_test_wide_vit(pretrained=False, **kwargs):
     wide = {"patch_size": 14, "embed_dim": 768, "depth": 1, "num_heads": 12, "init_values": 0.1}
     registers = {"reg_tokens": 4, "no_embed_class": True}
     name = "vit_small_patch14_reg4_dinov2"  # for its pretrained_cfg alone
-    return _create_vision_transformer(
-        name, pretrained=pretrained, **(wide | registers | kwargs)
-    )  # fmt: skip
+    return _create_vision_transformer(name, pretrained=pretrained, **(wide | registers | kwargs))
 
 
 @pytest.fixture(scope="module")
@@ -86,9 +84,7 @@ def _theirs(golden) -> dict[str, torch.Tensor]:
 
 def test_equals_the_public_code(golden, monkeypatch):
     got, want = _gaussians(golden, monkeypatch), _theirs(golden)
-    assert got.quats is None and torch.equal(
-        want["quats"], torch.tensor([1.0, 0, 0, 0]).double().expand(256, 4)
-    )
+    assert got.quats is None and (want["quats"] == torch.tensor([1.0, 0, 0, 0])).all()
     for name in ("means", "opacities", "scales", "colors"):
         # their scan is in float32; scales have our floor of 1e-6
         error = (getattr(got, name) - want[name]).abs().max()
@@ -174,11 +170,11 @@ def test_any_float_dtype(golden, tmp_path, wide, dtype):
 @pytest.mark.parametrize("depth, found", [(2, 1), (14, 2), (1, 2)])
 def test_a_file_without_its_last_blocks_is_refused(golden, tmp_path, depth, found):
     state = _state(golden)
-    part = {
-        k: v for k, v in state.items() if "layers.1.mamba" not in k and "layers.1.cond" not in k
-    }
+    if found == 1:
+        last = ("model.transformer.layers.1.mamba", "model.transformer.layers.1.cond")
+        state = {name: value for name, value in state.items() if not name.startswith(last)}
     words = f"a: holds {found} blocks?, not {depth}: a part .* --depth {found} accepts"
-    refused(words, convert_released, part if found == 1 else state, "a", depth)
+    refused(words, convert_released, state, "a", depth)
     assert DEPTH == PRESETS["released"].depth == 14
     assert inspect.signature(import_released_command).parameters["depth"].default == DEPTH
 

@@ -3,8 +3,9 @@
 import math
 
 import torch
+from helpers.model import inputs, micro
 
-from gamba_warp.cameras import Cameras, intrinsics, orbit, plucker_rays
+from gamba_warp.cameras import Cameras, plucker_rays
 from gamba_warp.model.config import GambaConfig
 from gamba_warp.model.parts.decoder import GaussianDecoder
 from gamba_warp.model.parts.tokens import (
@@ -13,16 +14,6 @@ from gamba_warp.model.parts.tokens import (
     normalize_imagenet,
     scan_orders,
 )
-
-
-def _config(**changes) -> GambaConfig:
-    small = {"image_size": 12, "patch_size": 4, "width": 8, "depth": 1, "encoder": "none"}
-    return GambaConfig(**(small | changes))
-
-
-def _cameras(batch: int, size: int) -> Cameras:
-    viewmats = orbit(torch.linspace(0, 200, batch), 17.0)
-    return Cameras(viewmats, intrinsics(size, size).expand(batch, 3, 3), size, size)
 
 
 def test_scan_orders_known_answer():
@@ -56,9 +47,8 @@ def test_camera_numbers_known_answer_and_size_independent():
 
 
 def test_splat_tokens_equal_patch_by_patch_sum():
-    config = _config()
-    module = SplatTokens(config)
-    images, cameras = torch.rand(3, 12, 12, 3), _cameras(3, 12)
+    module = SplatTokens(micro())
+    images, cameras = inputs(3)
     got = module(images, cameras)
     rays = plucker_rays(cameras.viewmats, cameras.Ks, 12, 12)
     pixels = torch.cat([normalize_imagenet(images), rays], -1)
@@ -73,9 +63,9 @@ def test_splat_tokens_equal_patch_by_patch_sum():
 
 
 def test_rays_stay_exact_under_autocast():
-    module = SplatTokens(_config())
+    module = SplatTokens(micro())
     torch.nn.init.zeros_(module.embedding)
-    images, cameras = torch.full((1, 12, 12, 3), 0.5), _cameras(1, 12)
+    images, cameras = inputs(1)
     seen = []
     module.patchify.register_forward_pre_hook(lambda _, inputs: seen.append(inputs[0]))
     with torch.autocast("cpu", torch.bfloat16):
@@ -86,26 +76,26 @@ def test_rays_stay_exact_under_autocast():
 
 
 def test_without_image_tokens_only_the_embedding_is_left():
-    module = SplatTokens(_config(additive_image_tokens=False))
-    tokens = module(torch.rand(2, 12, 12, 3), _cameras(2, 12))
-    assert torch.equal(tokens, module.embedding.expand(2, 36, 8))
+    module = SplatTokens(micro(additive_image_tokens=False))
+    tokens = module(*inputs(2))
+    assert torch.equal(tokens, module.embedding.expand(2, 36, 16))
     assert [name for name, _ in module.named_parameters()] == ["embedding"]
 
 
 def test_tokens_differ_on_a_plain_background():
     # Otherwise the decoder would put the Gaussians of all background patches at one point.
-    tokens = SplatTokens(_config(width=64))(torch.ones(1, 12, 12, 3), _cameras(1, 12))[0]
+    tokens = SplatTokens(micro(width=64))(torch.ones(1, 12, 12, 3), inputs(1)[1])[0]
     centred = tokens - tokens.mean(0)
     fraction = (centred.square().mean() / tokens.square().mean()).sqrt().item()
     assert 0.3 < fraction < 1 and math.isfinite(fraction)
 
 
-def _decoder_config(**changes) -> GambaConfig:
-    return GambaConfig(**({"width": 48, "encoder": "none"} | changes))
+def decoder_of(**changes) -> GaussianDecoder:
+    return GaussianDecoder(GambaConfig(width=48, encoder="none", **changes))
 
 
 def test_ranges_and_shapes_for_wild_tokens():
-    decoder = GaussianDecoder(_decoder_config(predict_rotation=True))
+    decoder = decoder_of(predict_rotation=True)
     gaussians = decoder(100 * torch.randn(2, 33, 48))
     assert gaussians.means.shape == (2, 33, 3) and gaussians.means.abs().max() <= 0.5
     assert gaussians.quats.shape == (2, 33, 4)
@@ -117,8 +107,7 @@ def test_ranges_and_shapes_for_wild_tokens():
 
 
 def test_position_is_the_expectation_over_the_points():
-    decoder = GaussianDecoder(_decoder_config())
-    tokens = torch.randn(1, 5, 48)
+    decoder, tokens = decoder_of(), torch.randn(1, 5, 48)
     logits = decoder.position(decoder.mlp(tokens)).reshape(1, 5, 3, 21).double()
     weights = logits.exp() / logits.exp().sum(-1, keepdim=True)
     points = torch.tensor([-0.5 + 0.05 * k for k in range(21)], dtype=torch.float64)
@@ -128,15 +117,11 @@ def test_position_is_the_expectation_over_the_points():
 
 
 def test_start_values_follow_the_config():
-    decoder = GaussianDecoder(
-        _decoder_config(scale_init=0.03, opacity_init=0.3, predict_rotation=True)
-    )
+    decoder = decoder_of(scale_init=0.03, opacity_init=0.3, predict_rotation=True)
     gaussians = decoder(torch.randn(1, 4000, 48))
     # The heads' small random weights add a little spread around the biases.
     assert 0.025 < gaussians.scales.median() < 0.035
-    large = GaussianDecoder(_decoder_config(scale_init=0.1, scale_factor=0.05))(
-        torch.randn(1, 999, 48)
-    )
+    large = decoder_of(scale_init=0.1, scale_factor=0.05)(torch.randn(1, 999, 48))
     assert 0.095 < large.scales.median() < 0.105
     assert 0.25 < gaussians.opacities.median() < 0.35
     assert 0.45 < gaussians.colors.median() < 0.55
@@ -146,9 +131,8 @@ def test_start_values_follow_the_config():
 
 
 def test_float32_under_autocast():
-    decoder = GaussianDecoder(_decoder_config())
     with torch.autocast("cpu", torch.bfloat16):
-        gaussians = decoder(torch.randn(1, 7, 48))
+        gaussians = decoder_of()(torch.randn(1, 7, 48))
     assert gaussians.quats is None
     for value in (gaussians.means, gaussians.scales, gaussians.opacities, gaussians.colors):
         assert value.dtype == torch.float32

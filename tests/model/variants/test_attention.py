@@ -17,7 +17,6 @@ from helpers.model import (
 )
 from helpers.refusals import refused
 
-from gamba_warp.errors import UserError
 from gamba_warp.kernels.runtime.packed import Packed
 from gamba_warp.model.config import GambaConfig
 from gamba_warp.model.gamba import Gamba
@@ -148,20 +147,16 @@ def test_bfloat16_autocast_stays_near_float32():
 
 def test_sizes():
     with torch.device("meta"):
-        plain, wide = (
-            Gamba(GambaConfig(encoder="none", dt_rank=32, **changes))
-            for changes in ({}, {"mixer": "attention", "attention_mlp": 1})
-        )
+        plain = Gamba(GambaConfig(encoder="none", dt_rank=32))
+        wide = Gamba(GambaConfig(encoder="none", mixer="attention", attention_mlp=1))
     counts = [sum(p.numel() for p in m.blocks.parameters()) for m in (plain, wide)]
     assert 0.93 < counts[1] / counts[0] < 1.0
-    assert wide.blocks[0].heads == 8
-    assert GambaConfig(width=48).num_heads == 1
+    assert wide.blocks[0].heads == 8 and GambaConfig(width=48).num_heads == 1
 
 
 def test_refused():
-    refused(
-        "width 16 is not a multiple of num_heads 3", micro, mixer="attention", attention_heads=3
-    )
+    said = "width 16 is not a multiple of num_heads 3"
+    refused(said, micro, mixer="attention", attention_heads=3)
     assert micro(attention_heads=3).mixer == "mamba"
-    with pytest.raises(UserError, match="mlp_width is 65,536, over 32,768"):
-        GambaConfig(mixer="attention", width=4096, attention_mlp=16, depth=1)
+    wide = {"mixer": "attention", "width": 4096, "attention_mlp": 16, "depth": 1}
+    refused("mlp_width is 65,536, over 32,768", GambaConfig, **wide)

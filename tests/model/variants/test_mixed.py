@@ -112,7 +112,8 @@ def test_the_first_quarter_are_patches_of_twice_the_side(orders):
     images, cameras = inputs(2, 24)
     got = module(images, cameras)
     assert got.shape == (2, 144, 16) and module.patchify.weight.shape == (16, 9, 8, 8)
-    pixels = torch.cat([normalize_imagenet(images), plucker_rays(*_seen(cameras))], -1)
+    rays = plucker_rays(cameras.viewmats, cameras.Ks, 24, 24)
+    pixels = torch.cat([normalize_imagenet(images), rays], -1)
     weight, bias = module.patchify.weight, module.patchify.bias
     for token, place in enumerate(scan_orders(3, 3, orders).flatten().tolist()):
         row, column = 8 * (place // 3), 8 * (place % 3)
@@ -121,10 +122,6 @@ def test_the_first_quarter_are_patches_of_twice_the_side(orders):
         # Sums of 576 float32 products in another order.
         assert torch.allclose(got[:, token], want, atol=2e-5), token
     assert torch.equal(got[:, 36:], module.embedding[36:].expand(2, -1, -1))
-
-
-def _seen(cameras):
-    return cameras.viewmats, cameras.Ks, 24, 24
 
 
 def test_dropping_background_keeps_what_has_no_patch():

@@ -79,10 +79,8 @@ def test_other_attributes_are_those_of_the_paper_s_decoder():
     model = Gamba(micro(encoder="none", **PLANES))
     plain = Gamba(micro(encoder="none"))
     shared = {n: v for n, v in model.state_dict().items() if n in plain.state_dict()}
-    assert plain.load_state_dict(shared, strict=False).missing_keys == [
-        "decoder.color.weight",
-        "decoder.color.bias",
-    ]
+    missing = plain.load_state_dict(shared, strict=False).missing_keys
+    assert missing == ["decoder.color.weight", "decoder.color.bias"]
     batch = inputs(2)
     for name in FIELDS[:3]:
         assert torch.equal(getattr(model(*batch), name), getattr(plain(*batch), name)), name
@@ -94,9 +92,8 @@ def test_order_of_the_tokens_is_that_of_the_gaussians():
     made, other = decoder(tokens, planes), decoder(tokens[:, order], planes)
     for name in FIELDS:
         # Products of the same rows at other places.
-        torch.testing.assert_close(
-            getattr(made, name)[:, order], getattr(other, name), rtol=1e-5, atol=1e-6
-        )
+        got, want = getattr(made, name)[:, order], getattr(other, name)
+        torch.testing.assert_close(got, want, rtol=1e-5, atol=1e-6)
 
 
 def test_colours_move_the_planes_and_no_position():

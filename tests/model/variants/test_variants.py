@@ -63,10 +63,8 @@ ABLATIONS = [
 
 @pytest.mark.parametrize("preset", PRESETS)
 def test_presets_store_what_they_stored(preset, monkeypatch):
-    trunk = VGG16Trunk
-    monkeypatch.setattr(
-        "gamba_warp.vision.vgg.vgg16_features", lambda path: VGG16Features(trunk().state_dict())
-    )
+    features = "gamba_warp.vision.vgg.vgg16_features"
+    monkeypatch.setattr(features, lambda path: VGG16Features(VGG16Trunk().state_dict()))
     config = PRESETS[preset]
     with torch.device("meta"):
         model = Gamba(config, None if config.encoder == "vgg16" else "random")
