@@ -102,9 +102,8 @@ def test_rigid_icp_keeps_the_size():
     points = sample(CHAIR, 4000, 0)
     larger = Similarity(np.eye(3), np.array([0.02, 0, 0]), 1.1).apply(points)
     rigid, free = (aligned(larger, points, (step,))[0] for step in ("rigid", "icp"))
-    assert rigid.scale == pytest.approx(1, abs=1e-9) and free.scale == pytest.approx(
-        1 / 1.1, abs=0.01
-    )
+    assert rigid.scale == pytest.approx(1, abs=1e-9)
+    assert free.scale == pytest.approx(1 / 1.1, abs=0.01)
 
 
 @pytest.mark.parametrize("name, turns", [("chair", 0), ("box", 3), ("cube", 23), ("ball", None)])

@@ -23,12 +23,10 @@ pytestmark = pytest.mark.usefixtures("one_thread")
 
 def gt_at(azimuths, elevation=0.0, distance=1.5, image=None):
     """Return a ground truth whose input image is ``image``, with further cameras."""
-    viewmats = torch.cat(
-        [orbit(torch.zeros(1)), orbit(torch.tensor(azimuths), elevation, distance)]
-    )
+    others = orbit(torch.tensor(azimuths), elevation, distance)
+    viewmats = torch.cat([orbit(torch.zeros(1)), others])
     count = len(viewmats)
-    if image is None:
-        image = torch.rand(HEIGHT, WIDTH, 4)
+    image = torch.rand(HEIGHT, WIDTH, 4) if image is None else image
     cameras = Cameras(viewmats, intrinsics(WIDTH, HEIGHT, 40.0).expand(count, 3, 3), WIDTH, HEIGHT)
     images = torch.cat([image[None], torch.rand(count - 1, HEIGHT, WIDTH, 4)])
     return GroundTruth("a", images, cameras, list(range(count)))

@@ -101,9 +101,8 @@ def write_seen(data, folder):
     for uid in dataset.uids:
         views = dataset.load(uid)
         viewmats, points = views.cameras.viewmats.double(), []
-        rows, columns = torch.meshgrid(
-            *2 * [torch.arange(views.cameras.width) + 0.5], indexing="ij"
-        )
+        places = torch.arange(views.cameras.width) + 0.5
+        rows, columns = torch.meshgrid(places, places, indexing="ij")
         pixels = torch.stack([columns, rows, torch.ones_like(rows)], -1).double()
         for depth, viewmat, K in zip(views.depths, viewmats, views.cameras.Ks.double()):
             local = depth[..., None] * (pixels @ torch.linalg.inv(K).T)
@@ -193,10 +192,8 @@ def test_who_is_missing_of_a_set(tmp_path):
         shutil.copy(tmp_path / "meshes" / "bench" / "model.obj", pred / f"{uid}.obj")
     known = open_objects(data)[1]
     pairs, failures = find_pairs(pred, tmp_path / "meshes", known=known)
-    assert [(pair.name, pair.gt.name) for pair in pairs] == [
-        ("lamp", "model.glb"),
-        ("lamp-obj", "model.obj"),
-    ]
+    found = {pair.name: pair.gt.name for pair in pairs}
+    assert found == {"lamp": "model.glb", "lamp-obj": "model.obj"}
     assert [(item["name"], item["reason"]) for item in failures] == [("table", "no prediction")]
 
 

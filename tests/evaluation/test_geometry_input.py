@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import trimesh
 from helpers.children import faulty_pair
-from helpers.meshes import as_mesh
+from helpers.meshes import CORNERS, XYZ, as_mesh, ply_head
 
 from gamba_warp.cli import run
 from gamba_warp.eval.shapes import pairs
@@ -18,9 +18,7 @@ from gamba_warp.eval.shapes.shape import Mesh
 
 
 def box(side=1.0, move=(0.0, 0, 0)):
-    mesh = trimesh.creation.box((side, side, side))
-    mesh.apply_translation(move)
-    return mesh
+    return trimesh.creation.box((side,) * 3).apply_translation(move)
 
 
 def evaluate(capfd, *arguments):
@@ -39,34 +37,29 @@ def pairs_of(folder, names):
     return folder / "pred", folder / "gt"
 
 
-def ply(elements, body, layout="binary_little_endian"):
-    lines = ["ply", f"format {layout} 1.0", *elements, "end_header", ""]
-    return "\n".join(lines).encode() + body
+def cloud(count, points):
+    """Return a binary .ply of points, whose header states a number of them."""
+    head = ply_head("binary_little_endian", vertex=(count, *XYZ))
+    return head.encode() + np.asarray(points, "<f4").tobytes()
 
 
-def vertices_of(count):
-    return [f"element vertex {count}", *(f"property float {axis}" for axis in "xyz")]
+def triangle(points, count=3):
+    """Return a binary .ply of one face, whose header states a number of vertices."""
+    head = ply_head("binary_little_endian", vertex=(count, *XYZ), face=(1, CORNERS))
+    return head.encode() + np.asarray(points, "<f4").tobytes() + struct.pack("<B3i", 3, 0, 1, 2)
 
 
-def faces_of(count, kind="uchar"):
-    return [f"element face {count}", f"property list {kind} int vertex_indices"]
-
-
-TRIANGLE = np.eye(3, dtype="<f4").tobytes()
-FACE = struct.pack("<B3i", 3, 0, 1, 2)
-BOTH = [*vertices_of(3), *faces_of(1)]
-
-
+SCALE = ply_head("binary_little_endian", vertex=(1, "float scale_0")).encode()
 BAD = {
     "empty": (b"", "empty"),
-    "blank": (ply(vertices_of(0), b""), "contains no points"),
-    "nan": (ply(BOTH, np.full((3, 3), np.nan, "<f4").tobytes() + FACE), "not finite"),
-    "inf_cloud": (ply(vertices_of(3), np.full((3, 3), np.inf, "<f4").tobytes()), "not finite"),
-    "huge": (ply(BOTH, (1e30 * np.eye(3, dtype="<f4")).tobytes() + FACE), "1e+30"),
-    "far": (ply(BOTH, (1e9 * np.eye(3, dtype="<f4")).tobytes() + FACE), "longest side"),
-    "flat": (ply(BOTH, np.diag([1, 1, 0]).astype("<f4")[[0, 0, 1]].tobytes() + FACE), "no area"),
-    "lies": (ply([*vertices_of(10**12), *faces_of(1)], TRIANGLE + FACE), "invalid header"),
-    "half": (ply(["element vertex 1", "property float scale_0"], bytes(4)), "not Gaussians"),
+    "blank": (cloud(0, []), "contains no points"),
+    "nan": (triangle(np.full((3, 3), np.nan)), "not finite"),
+    "inf_cloud": (cloud(3, np.full((3, 3), np.inf)), "not finite"),
+    "huge": (triangle(1e30 * np.eye(3)), "1e+30"),
+    "far": (triangle(1e9 * np.eye(3)), "longest side"),
+    "flat": (triangle(np.eye(3)[[0, 0, 1]]), "no area"),
+    "lies": (triangle(np.eye(3), 10**12), "invalid header"),
+    "half": (SCALE + bytes(4), "not Gaussians"),
     "noise": (b"nothing", "not a .ply"),
 }
 
@@ -207,10 +200,8 @@ def test_what_of_a_shape_is_not_read_is_in_the_report(tmp_path, capfd):
         text = box().export(file_type="obj")
         (tmp_path / f"{name}.obj").write_text(text + more)
     _, report = evaluate(capfd, tmp_path / "pred.obj", tmp_path / "gt.obj")
-    assert report["warnings"] == [
-        "1 of 1 predictions: the statement l is not read",
-        "1 of 1 predictions: the statement vp is not read",
-    ]
+    said = "1 of 1 predictions: the statement {} is not read"
+    assert report["warnings"] == [said.format("l"), said.format("vp")]
 
 
 def test_a_limit_takes_objects_of_either_folder(tmp_path, capfd):

@@ -37,6 +37,7 @@ def poses(names, azimuths):
 
 
 AZIMUTHS = torch.arange(VIEWS) * 60.0
+NAMES = [f"view{v}.png" for v in range(VIEWS)]
 
 
 @pytest.fixture
@@ -45,9 +46,8 @@ def data(tmp_path):
     for number, uid in enumerate(UIDS):
         folder = tmp_path / "data" / uid
         folder.mkdir(parents=True)
-        names = [f"view{v}.png" for v in range(VIEWS)]
-        (folder / "transforms.json").write_text(poses(names, AZIMUTHS))
-        for v, name in enumerate(names):
+        (folder / "transforms.json").write_text(poses(NAMES, AZIMUTHS))
+        for v, name in enumerate(NAMES):
             Image.fromarray(rgba(10 * number + v)).save(folder / name)
         shutil.copytree(folder, tmp_path / "pred" / uid)
         (tmp_path / "pred" / uid / "transforms.json").unlink()
@@ -87,10 +87,8 @@ def test_by_name_by_number_and_by_camera_is_the_same(data):
         azimuths = torch.tensor([75.0, 120, 0, 180, 60]) + 0.01
         (folder / "transforms.json").write_text(poses(names, azimuths))
     code, found = evaluate(data)
-    assert code == 0
-    assert found["objects"][0]["images"] == {
-        **{"matched_by": "camera", "unused": 1, "resized": 0, "alpha": True}
-    }
+    want = {"matched_by": "camera", "unused": 1, "resized": 0, "alpha": True}
+    assert code == 0 and found["objects"][0]["images"] == want
     assert found["mean"]["psnr"] == named["mean"]["psnr"] == 100
 
 
@@ -127,18 +125,16 @@ def test_images_without_alpha_have_no_mask(data):
     assert report["mean"]["psnr_black"] is None and report["protocol"]["grounds"]["grey"] == 0.5
     assert "absent" in (data / "out" / "table.md").read_text()
     # An alpha that is 1 everywhere says nothing either.
-    Image.open(data / "pred" / "a" / "view1.png").convert("RGBA").save(
-        data / "pred" / "a" / "view1.png"
-    )
+    path = data / "pred" / "a" / "view1.png"
+    Image.open(path).convert("RGBA").save(path)
     assert "view0.png: has no alpha" in evaluate(data)[1]["failures"][0]["reason"]
 
 
 def test_the_input_need_not_be_there(data):
     (data / "pred" / "a" / "view0.png").unlink()
     code, report = evaluate(data)
-    assert code == 0
     record = report["objects"][0]
-    assert record["psnr"] == 100 and record["input"]["psnr"] is None
+    assert code == 0 and record["psnr"] == 100 and record["input"]["psnr"] is None
     rows = {(row["views"], row["objects"]) for row in report["table"]}
     assert rows == {("novel", 2), ("input", 1)}
 
@@ -159,21 +155,10 @@ def on_black(folder):
         Image.fromarray(image[..., :3] * (image[..., 3:] > 0)).save(path)
 
 
-def turned_cameras(folder):
-    names = [f"view{v}.png" for v in range(VIEWS)]
-    (folder / "transforms.json").write_text(poses(names, AZIMUTHS + 3))
-
-
-def other_intrinsics(folder):
-    names = [f"view{v}.png" for v in range(VIEWS)]
-    text = poses(names, AZIMUTHS).replace('"fl_x": ', '"fl_x": 1')
-    (folder / "transforms.json").write_text(text)
-
-
-def two_at_one_camera(folder):
-    names = [f"view{v}.png" for v in (0, 1, 2, 3)]
-    azimuths = torch.tensor([0.0, 60, 120, 120])
-    (folder / "transforms.json").write_text(poses(names, azimuths))
+def with_cameras(azimuths, focal='"fl_x": '):
+    """Return a function that states cameras of an object's images."""
+    text = poses(NAMES, azimuths).replace('"fl_x": ', focal)
+    return lambda folder: (folder / "transforms.json").write_text(text)
 
 
 @pytest.mark.parametrize(
@@ -184,9 +169,12 @@ def two_at_one_camera(folder):
         (double_a_number, "has the same number"),
         (shrink, "is 12x12, the images compared are 24x24"),
         (on_black, "background rgb(0, 0, 0)"),
-        (turned_cameras, "rotated by 3 degrees"),
-        (other_intrinsics, "its intrinsics differ by"),
-        (two_at_one_camera, "view2.png and view3.png both have the camera of view 2"),
+        (with_cameras(AZIMUTHS + 3), "rotated by 3 degrees"),
+        (with_cameras(AZIMUTHS, '"fl_x": 1'), "its intrinsics differ by"),
+        (
+            with_cameras(torch.tensor([0.0, 60, 120, 120])),
+            "view2.png and view3.png both have the camera of view 2",
+        ),
         (lambda x: (x / "view1.png").write_bytes(b""), "view1.png: the file is empty"),
         (shutil.rmtree, "no such folder"),
     ],

@@ -44,18 +44,10 @@ def assert_as_alone(pair, protocols, found):
 
 def test_each_row_is_what_its_protocol_gives(folders, monkeypatch):
     """Stages that rows have in common are computed once; that must change no figure."""
-    changes = {
-        "points": ("views",),
-        "num_points": (400,),
-        "seed": (1,),
-        "unit": (2.0,),
-        "chamfer": ("squared-sum",),
-        "align": (("scale", "yaw"),),
-        "occupancy": ("parity",),
-        "grid": ("lattice",),
-        "iou_voxels": (24,),
-    }
-    monkeypatch.setattr(sensitivity, "_CHANGES", changes)
+    changes = {"points": "views", "num_points": 400, "seed": 1, "unit": 2.0, "iou_voxels": 24}
+    changes |= {"chamfer": "squared-sum", "occupancy": "parity", "grid": "lattice"}
+    changes |= {"align": ("scale", "yaw")}
+    monkeypatch.setattr(sensitivity, "_CHANGES", {name: (v,) for name, v in changes.items()})
     monkeypatch.setattr(sensitivity, "PRESETS", {})
     protocols = sensitivity.variants(SMALL)
     assert len(protocols) == 1 + len(changes)
@@ -85,10 +77,8 @@ def test_sheets_of_a_command(folders, monkeypatch, capfd):
 def test_rows_that_differ_by_the_surface_or_the_thresholds_alone(folders):
     save_ply(folders / "pred" / "a.ply", some(40))
     pair = find_pairs(folders / "pred", folders / "gt")[0][0]
-    centers, density = (
-        replace(SMALL, surface=SurfaceOptions(method=method, voxels=16))
-        for method in ("centers", "density")
-    )
+    methods = (SurfaceOptions(method=method, voxels=16) for method in ("centers", "density"))
+    centers, density = (replace(SMALL, surface=surface) for surface in methods)
     protocols = {"a": centers, "b": density, "c": replace(centers, thresholds=(0.2, 0.1))}
     found = sensitivity.vary_pair(pair, SMALL, None, protocols)["variants"]
     assert_as_alone(pair, protocols, found)

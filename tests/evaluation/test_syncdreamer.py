@@ -51,9 +51,8 @@ def unit(mesh):
 def pair_of(name):
     make = trimesh.creation
     if name == "ball":
-        return moved(make.icosphere(3, 0.4), MOVE((0.03, -0.02, 0.01))), unit(
-            make.icosphere(4, 0.5)
-        )
+        small = moved(make.icosphere(3, 0.4), MOVE((0.03, -0.02, 0.01)))
+        return small, unit(make.icosphere(4, 0.5))
     if name == "box":
         box = moved(make.box((0.9, 0.5, 0.3)), ASLANT)
         return moved(box, turn((0, 0, 1), 12) @ MOVE((0.02, 0.01, 0))), unit(box)

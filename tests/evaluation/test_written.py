@@ -39,9 +39,8 @@ def disc(size: int) -> torch.Tensor:
 
 def dataset(folder, size: int, fov: float = 49.1):
     """One object whose three views all show the disc."""
-    write_views(
-        folder / "a", disc(size).expand(3, -1, -1, -1), around([0, 90, 180], 0, 1.5, size, fov)
-    )
+    cameras = around([0, 90, 180], 0, 1.5, size, fov)
+    write_views(folder / "a", disc(size).expand(3, -1, -1, -1), cameras)
     write_split(folder, test=["a"])
     return folder
 
@@ -91,10 +90,8 @@ def test_the_size_that_is_compared_decides_by_default(model, tmp_path):
 @pytest.mark.parametrize("fov", [25.0, 70.0])
 def test_the_front_splits_along_the_rays_of_the_view_s_own_camera(model, tmp_path, fov):
     data = dataset(tmp_path / "data", 4 * CELLS, fov)
-    sharp, plain = (
-        number_and_psnr(model, data, tmp_path / f"{detail}", "--detail", detail)[1]
-        for detail in (4, 1)
-    )
+    outs = {detail: tmp_path / f"{detail}" for detail in (4, 1)}
+    sharp, plain = (number_and_psnr(model, data, outs[k], "--detail", k)[1] for k in (4, 1))
     assert sharp > plain + 3, (sharp, plain)  # dB; with another camera's rays it is less than plain
 
 

@@ -18,12 +18,7 @@ from gamba_warp.gaussians import Gaussians
 from gamba_warp.kernels.rasterize import depth_quantile
 from gamba_warp.render import render
 from gamba_warp.surfaces.density import MOST_POINTS, opacity_volume
-from gamba_warp.surfaces.extract import (
-    Surface,
-    cleaned_mesh,
-    extract_surface,
-    unit_frame,
-)
+from gamba_warp.surfaces.extract import Surface, cleaned_mesh, extract_surface, unit_frame
 from gamba_warp.surfaces.files import save_mesh
 from gamba_warp.surfaces.options import SurfaceOptions
 from gamba_warp.surfaces.solid import distances, solid_of
@@ -33,6 +28,7 @@ from gamba_warp.versions import import_open3d
 
 UNCHANGED = SurfaceOptions(min_component=0, close_holes=0)  # of a mesh that is cleaned
 QUICK = dict(voxels=64, views=24, pixels=128)
+SEEN = SurfaceOptions(views=24, pixels=96, transmittance=0.9)
 
 
 def at(points, sigma=0.010, opacity=0.9, colors=0.5):
@@ -77,9 +73,8 @@ def as_trimesh(surface):
 @pytest.mark.parametrize("method", ["tsdf", "density"])
 def test_a_sphere_within_a_voxel(method):
     """In front of the centres: by the near Gaussians' edges, or by the width of the level set."""
-    surface = extract_surface(
-        at(0.4 * fibonacci_sphere(4000)), SurfaceOptions(method=method, **QUICK)
-    )
+    ball = at(0.4 * fibonacci_sphere(4000))
+    surface = extract_surface(ball, SurfaceOptions(method=method, **QUICK))
     error = (np.linalg.norm(surface.vertices, axis=1) - 0.4) * QUICK["voxels"]
     assert abs(error.mean()) < 1 and math.sqrt(np.mean(error**2)) < 1
     assert np.mean(abs(error) < 1) > 0.95 and abs(error).max() < 1.5
@@ -136,9 +131,7 @@ def test_colors_of_a_sphere_of_two():
 
 
 def test_an_unseen_vertex_takes_the_nearest_color():
-    views = look_around(
-        at(0.4 * fibonacci_sphere(2000)), SurfaceOptions(views=24, pixels=96, transmittance=0.9)
-    )
+    views = look_around(at(0.4 * fibonacci_sphere(2000)), SEEN)
     ball = trimesh.creation.icosphere(3, 0.4)
     inside = np.array([[0.0, 0, 0], [0.01, 0, 0], [0, 0.01, 0]])
     vertices = np.concatenate([ball.vertices, inside])
@@ -149,9 +142,7 @@ def test_an_unseen_vertex_takes_the_nearest_color():
 
 def test_space_that_is_seen_through_is_cleared():
     """Depth of one view makes a wall out of a speck; the others see past it."""
-    views = look_around(
-        at(0.3 * fibonacci_sphere(2000)), SurfaceOptions(views=24, pixels=96, transmittance=0.9)
-    )
+    views = look_around(at(0.3 * fibonacci_sphere(2000)), SEEN)
     cameras = views.cameras
     depth = views.depth.clone()
     depth[0, :24] = float(cameras.viewmats[0, 2, 3])  # a wall through the centre, beside the ball
@@ -214,28 +205,20 @@ def test_a_clean_mesh_of_nothing():
 
 @pytest.mark.parametrize("method", ["tsdf", "density"])
 @pytest.mark.parametrize(
-    "case, reason",
+    "change, reason",
     [
-        ("empty", "no Gaussian"),
-        ("clear", "no Gaussian"),
-        ("far", "within"),
-        ("nan", "1 of 20 Gaussians are not finite"),
-        ("infinite", "1 of 20 Gaussians are not finite"),
+        (lambda some: some.opacities.zero_(), "no Gaussian"),
+        (lambda some: some.means.add_(5), "within"),
+        (lambda some: some.scales[3, 1].fill_(math.nan), "1 of 20 Gaussians are not finite"),
+        (lambda some: some.means[3, 1].fill_(math.inf), "1 of 20 Gaussians are not finite"),
     ],
 )
-def test_what_has_no_surface(method, case, reason):
+def test_what_has_no_surface(method, change, reason):
     some = at(0.3 * fibonacci_sphere(20))
-    if case == "empty":
-        some = some.select(torch.zeros(20, dtype=torch.bool))
-    if case == "clear":
-        some.opacities[:] = 0
-    if case == "far":
-        some.means += 5
-    if case == "nan":
-        some.scales[3, 1] = math.nan
-    if case == "infinite":
-        some.means[3, 1] = math.inf
-    refused(reason, extract_surface, some, SurfaceOptions(method=method, **QUICK))
+    options = SurfaceOptions(method=method, **QUICK)
+    refused("no Gaussian", extract_surface, some.select(torch.zeros(20) > 0), options)
+    change(some)
+    refused(reason, extract_surface, some, options)
 
 
 @pytest.mark.parametrize("method", ["tsdf", "density"])
