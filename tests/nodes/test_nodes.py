@@ -86,12 +86,9 @@ def test_two_processes_become_one_and_one_becomes_two(data, runs, tmp_path):
     assert [end.returncode for end in train_all(two)] == [0, 0]
     for name in ("one", "two"):
         assert same_weights(weights(tmp_path / name, STEPS), weights(runs / "halves", STEPS)), name
-    refused(
-        r"objects a step \(4 there, 2 here: --batch-size 4 keeps it\)",
-        *(run, data, tmp_path / "other"),
-        run=resumed,
-        **options | {"views": {**VIEWS, "batch_size": 2}},
-    )
+    options["views"] = {**VIEWS, "batch_size": 2}
+    said = r"objects a step \(4 there, 2 here: --batch-size 4 keeps it\)"
+    refused(said, run, data, tmp_path / "other", run=resumed, **options)
 
 
 def test_the_run_is_one_of_all_processes(runs):

@@ -63,14 +63,9 @@ def decoded(source):
 
 
 def full(title="A chair", **changes):
-    values = dict(
-        text="Seen once.",
-        image=images(9, 9, 4),
-        turntable=frames(),
-        gaussians=some(11),
-        table=[("input", "24.3 dB"), ("note", "n/a")],
-    )
-    return Section(title, **{**values, **changes})
+    values = dict(text="Seen once.", image=images(9, 9, 4), turntable=frames(), gaussians=some(11))
+    table = [("input", "24.3 dB"), ("note", "n/a")]
+    return Section(title, **{**values, "table": table, **changes})
 
 
 def test_a_page_holds_everything_and_asks_for_nothing(tmp_path):
@@ -119,10 +114,8 @@ def test_images_come_back_from_the_page(tmp_path):
 
 def test_text_is_escaped(tmp_path):
     nasty = '</script><b onload="x">&'
-    section = Section(nasty, text=nasty)
+    section = Section(nasty, text=nasty, files=[nasty], links={nasty: frames(1)[0]})
     section.table, section.details = [(nasty, "1"), ("1.5", nasty)], {nasty: nasty}
-    section.files = [nasty]
-    section.links = {nasty: frames(1)[0]}
     write_page(tmp_path / "a.html", nasty, [section], nasty)
     page = Page(tmp_path / "a.html")
     assert not page.all("b") and "</script><b" not in page.source
@@ -166,15 +159,9 @@ def row(views, name, psnr, **more):
 
 
 CARD = {
-    "data": "seven cubes",
-    "objects": 1234,
-    "steps": 5,
-    "compute": "a second",
-    "command": "gamba train cubes",
-    "seed": 3,
-    "use": "tests",
+    **{"data": "seven cubes", "objects": 1234, "steps": 5, "compute": "a second", "seed": 3},
+    **{"command": "gamba train cubes", "use": "tests", "measured": "here"},
     "limits": ["No spheres.", "No cones."],
-    "measured": "here",
     "figures": [
         row("novel", "model", 20.125, lpips={"mean": 0.3, "interval": [0.2, 0.4]}),
         row("novel", "billboard", 18.5, lpips={"mean": 0.25}),
@@ -204,10 +191,9 @@ def test_a_page_says_what_the_card_says(model):
 
 def test_a_model_without_a_card_says_so(tmp_path):
     assert read_card(tmp_path / "m.safetensors") is None
-    assert dict(about_model(tmp_path / "m.safetensors")) == {
-        "Model": "m.safetensors",
-        "Trained on": "not known: this model has no card",
-    }
+    model, trained = about_model(tmp_path / "m.safetensors")
+    assert model == ("Model", "m.safetensors")
+    assert trained == ("Trained on", "not known: this model has no card")
 
 
 @pytest.mark.parametrize(

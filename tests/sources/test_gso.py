@@ -35,23 +35,20 @@ MTL = "newmtl material_0\nmap_Kd texture.png\nKd 1.000000 1.000000 1.000000\n"
 # A box of 2 x 1 x 4, z up. Its front (-y) and sides show the texture's left half, its back the
 # right half.
 _CORNERS = [(x, y, z) for x in (-1, 1) for y in (-0.5, 0.5) for z in (-2, 2)]
-_FACES = [
-    ((0, 4, 5, 1), 1),
-    ((6, 2, 3, 7), 2),
-    ((2, 0, 1, 3), 1),
-    ((4, 6, 7, 5), 1),
-    ((1, 5, 7, 3), 1),
-    ((0, 2, 6, 4), 1),
-]
+_FACES = """f 1/1 5/1 6/1 2/1
+f 7/2 3/2 4/2 8/2
+f 3/1 1/1 2/1 4/1
+f 5/1 7/1 8/1 6/1
+f 2/1 6/1 8/1 4/1
+f 1/1 3/1 7/1 5/1
+"""
 
 
 def obj() -> str:
     """The mesh's text."""
     rows = ["mtllib model.mtl", "usemtl material_0"]
     rows += [f"v {x} {y} {z}" for x, y, z in _CORNERS]
-    rows += ["vt 0.25 0.5", "vt 0.75 0.5"]
-    rows += ["f " + " ".join(f"{c + 1}/{texel}" for c in face) for face, texel in _FACES]
-    return "\n".join(rows) + "\n"
+    return "\n".join([*rows, "vt 0.25 0.5", "vt 0.75 0.5", _FACES])
 
 
 def texture() -> bytes:
@@ -134,9 +131,9 @@ def test_a_model_in_one_folder(tmp_path):
 def test_views_and_meshes_of_a_copy_of_the_set(tmp_path, capsys):
     write_model(tmp_path / "set", FIRST)
     write_zip(tmp_path / "set", SECOND)
-    words = ["data", "gso", str(tmp_path / "out"), "--source", str(tmp_path / "set")]
+    words = [str(tmp_path / "out"), "--source", str(tmp_path / "set")]
     words += ["--size", "24", "--workers", "1", "--limit", "3"]
-    assert run("data gso", words[2:]) == 1
+    assert run("data gso", words) == 1
     said = capsys.readouterr()
     assert f"missing: {THIRD}: not in {tmp_path / 'set'}" in said.err
     assert "rendered 2 objects" in said.out and "1 of 3 missing" in said.out
@@ -146,9 +143,8 @@ def test_views_and_meshes_of_a_copy_of_the_set(tmp_path, capsys):
     refused(reason, open_dataset, tmp_path / "out" / "views", "train")
     views = data.load(0)
     # The model's box is 2 x 1 x 4 with z up in its file: upright in the image, from the front.
-    rows = views.images[0, ..., 3].amax(1) > 0.5
-    columns = views.images[0, ..., 3].amax(0) > 0.5
-    assert rows.sum() > 1.5 * columns.sum()
+    rows, columns = ((views.images[0, ..., 3].amax(axis) > 0.5).sum() for axis in (1, 0))
+    assert rows > 1.5 * columns
     # Its front, at -y, has the texture's left half, red; its back the right half, blue.
     for number, channel in ((0, 0), (4, 2)):
         colour = views.images[number, 12, 12, :3]
@@ -161,10 +157,9 @@ def test_views_and_meshes_of_a_copy_of_the_set(tmp_path, capsys):
     # The same command continues: existing objects are neither read nor rendered again.
     shutil.rmtree(tmp_path / "set" / FIRST)
     write_model(tmp_path / "set", THIRD)
-    assert run("data gso", words[2:]) == 0
+    assert run("data gso", words) == 0
     assert "rendered 1 object into" in capsys.readouterr().out
-    other = [word if word != "24" else "16" for word in words[2:]]
-    assert run("data gso", other) == 2
+    assert run("data gso", [word if word != "24" else "16" for word in words]) == 2
     assert "rendered with other settings" in capsys.readouterr().err
 
 

@@ -39,10 +39,8 @@ def test_records_hold_what_was_packed():
     np.testing.assert_allclose(records["scales"], gaussians.scales, rtol=half, atol=1e-7)
     np.testing.assert_allclose(records["look"][:, 0], gaussians.opacities, rtol=half)
     np.testing.assert_allclose(records["look"][:, 1:], gaussians.colors, rtol=half, atol=1e-7)
-    texels = texels.reshape(500, 16)  # whole texels of 8 numbers
-    np.testing.assert_allclose(
-        texels[:, :9], gaussians.harmonics.reshape(500, -1), rtol=half, atol=1e-7
-    )
+    texels, harmonics = texels.reshape(500, 16), gaussians.harmonics.reshape(500, -1)
+    np.testing.assert_allclose(texels[:, :9], harmonics, rtol=half, atol=1e-7)  # whole texels of 8
     assert not texels[:, 9:].any()
     p = records["turns"] / 32767
     k = 2 / (1 + (p * p).sum(1, keepdims=True))
@@ -69,8 +67,7 @@ def test_what_floats_far_away_does_not_count():
 
 def test_the_page_is_small_and_loads_nothing(tmp_path):
     write_viewer(tmp_path / "a.html", "A chair", some(1))
-    size = (tmp_path / "a.html").stat().st_size
-    assert size <= 300_000
+    assert (tmp_path / "a.html").stat().st_size <= 300_000
     page = (tmp_path / "a.html").read_text(encoding="utf-8")
     assert "http" not in page.replace("http-equiv", "") and "import(" not in page
     (policy,) = re.findall(r'http-equiv="Content-Security-Policy" content="([^"]*)"', page)

@@ -1,6 +1,7 @@
 """Precision of matrix products: the trial of "auto", float32 by oneDNN, and bfloat16."""
 
 import sys
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -123,12 +124,8 @@ def test_memory_is_kept_unless_the_user_has_a_say(monkeypatch, name):
         monkeypatch.delenv(other, raising=False)
     if name:
         monkeypatch.setenv(name, "1")
-    called = []
-
-    class Library:
-        def mallopt(self, *values) -> None:
-            called.append(tuple(value.value for value in values))
-
-    monkeypatch.setattr(devices.ctypes, "CDLL", lambda _: Library())
+    library = Mock()
+    monkeypatch.setattr(devices.ctypes, "CDLL", lambda _: library)
     devices.keep_memory()
+    called = [tuple(x.value for x in call.args) for call in library.mallopt.call_args_list]
     assert called == ([] if name else [devices._TRIM_THRESHOLD, devices._MMAP_THRESHOLD])
