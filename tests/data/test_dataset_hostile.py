@@ -131,9 +131,8 @@ def test_fields_of_view(tmp_path, angle):
 
 
 def test_gobjaverse_and_openlrm(tmp_path):
-    for number, camera in enumerate(
-        ({"x": 3}, {"x": ["a", 0, 0]}, {"origin": [0, 0, 0]}, {"x_fov": "1"}, {"z": [[1], 2, 3]})
-    ):
+    bad = {"x": 3}, {"x": ["a", 0, 0]}, {"origin": [0, 0, 0]}, {"x_fov": "1"}, {"z": [[1], 2, 3]}
+    for number, camera in enumerate(bad):
         gobjaverse(tmp_path / f"g{number}" / "x", **camera)
         assert "00000.json" in reason(tmp_path / f"g{number}" / "x")
     wide, nowhere = ((9, 9), (4, 4), (10**9, 8)), ((9, 9), (4e6, 4), (8, 8))
@@ -195,16 +194,15 @@ def test_a_split_may_name_more_than_is_there(tmp_path):
 
 
 def test_depth_is_finite_and_not_negative(tmp_path):
-    for number, value in enumerate((np.nan, np.inf, -1.0)):
-        transforms(tmp_path / f"{number}" / "x", {"depth_file_path": "d1.tiff"})
-        path = tmp_path / f"{number}" / "x" / "transforms.json"
-        values = json.loads(path.read_text())
-        values["frames"][0]["depth_file_path"] = "d0.tiff"
-        path.write_text(json.dumps(values))
-        for i in range(2):
-            depth = np.full((SIZE, SIZE), value if i else 1.0, np.float32)
-            Image.fromarray(depth).save(path.parent / f"d{i}.tiff")
-        assert "d1.tiff: a depth is negative or not finite" in reason(path.parent)
+    frames = [{"file_path": f"{i}.png", "transform_matrix": POSE} for i in range(2)]
+    for i, frame in enumerate(frames):
+        frame["depth_file_path"] = f"d{i}.tiff"
+    for value in (np.nan, np.inf, -1.0):
+        transforms(tmp_path / "x", frames=frames)
+        for i, depth in enumerate((1.0, value)):
+            image = Image.fromarray(np.full((SIZE, SIZE), depth, np.float32))
+            image.save(tmp_path / "x" / f"d{i}.tiff")
+        assert "d1.tiff: a depth is negative or not finite" in reason(tmp_path / "x")
 
 
 def test_images_that_would_fill_the_memory(tmp_path, monkeypatch):

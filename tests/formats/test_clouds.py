@@ -73,10 +73,9 @@ def test_the_same_as_open3d(tmp_path, name, options, normals):
 
 
 def test_columns_and_comments(tmp_path):
-    path = tmp_path / "a.xyz"
     text = "\ufeff# made by hand\n0 1 2 7 8 9\n\n 3\t4 5 7 8 9 \n"  # perhaps colours
-    path.write_text(text, encoding="utf-8", newline="")
-    cloud = read(path).shape
+    (tmp_path / "a.xyz").write_text(text, encoding="utf-8", newline="")
+    cloud = read(tmp_path / "a.xyz").shape
     assert cloud.positions.tolist() == [[0, 1, 2], [3, 4, 5]] and cloud.normals is None
 
 

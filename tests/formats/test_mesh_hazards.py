@@ -206,6 +206,7 @@ _NONE = {"componentType": 5121, "bufferView": None}  # values without bytes are 
 _SPREAD = {"extensions": {"EXT_mesh_gpu_instancing": {"attributes": {"TRANSLATION": 1}}}, "mesh": 0}
 _MORE = [ACCESSOR, ACCESSOR | {"bufferView": None, "count": 150_000}]
 _MORPHED = {"attributes": {"POSITION": 1}, "targets": [{"POSITION": 1}] * 20_000}
+_TWICE = [{"children": [i + 1, i + 1]} for i in range(40)]
 _MOVED = {"mesh": 0, "translation": [1, 2, 3], "scale": [1, 1, 2]}
 
 
@@ -220,9 +221,7 @@ SMALL = {
         "accessors": [ACCESSOR, _NONE | {"type": "SCALAR", "count": 2_949_999}],
         "meshes": [{"primitives": [{"attributes": {"POSITION": 0}, "indices": 1}]}],
     },
-    "every node has a child twice": {
-        "nodes": [*({"children": [i + 1, i + 1]} for i in range(40)), {"mesh": 0}]
-    },
+    "every node has a child twice": {"nodes": [*_TWICE, {"mesh": 0}]},
     "instances": {"nodes": [_SPREAD], "accessors": _MORE},
     "instances of 1,000 nodes": _scene(_SPREAD, 1000) | {"accessors": _MORE},
     "morph targets": {

@@ -1,6 +1,7 @@
 """Made objects that other processes render while a model trains: order, reuse, failures."""
 
 import collections
+import contextlib
 import signal
 
 import numpy as np
@@ -40,15 +41,8 @@ def views_of(number, settings):
 @pytest.fixture
 def opened():
     """Pools that end with the test."""
-    made = []
-
-    def open_pool(first=0, settings=VIEWS):
-        made.append(Pool(settings, first))
-        return made[-1]
-
-    yield open_pool
-    for each in made:
-        each.close()
+    with contextlib.ExitStack() as stack:
+        yield lambda first=0: stack.enter_context(contextlib.closing(Pool(VIEWS, first)))
 
 
 def test_every_object_is_used_as_often_as_told_in_rounds_that_differ(slots):
@@ -113,11 +107,9 @@ def test_a_share_of_the_samples_is_made_and_the_rest_stays(data, in_process, fra
         options = micro.options(data, data, views=views)
         return Batches(open_data(options), options, micro.ALONE, lambda number: 2)
 
-    plain, mixed = batches(0.0), batches(fraction)
-    try:
+    plain = batches(0.0)
+    with contextlib.closing(batches(fraction)) as mixed:
         ours, theirs = micro.take(mixed, 0), micro.take(plain, 0)
-    finally:
-        mixed.close()
     made = [uid.startswith("procedural-") for uid in ours.uids]
     assert sum(made) == expected
     assert ours.targets.shape == theirs.targets.shape

@@ -122,9 +122,8 @@ def test_two_forms_of_the_same_cameras(tmp_path):
     opengl = poses @ FLIP
     nerfstudio = {"camera_type": "perspective", "render_width": width, "render_height": height}
     nerfstudio |= {"seconds": 2, "fps": 24, "keyframes": []}
-    nerfstudio["camera_path"] = [
-        {"camera_to_world": pose.flatten().tolist(), "fov": fov, "aspect": 1.5} for pose in opengl
-    ]
+    path = [{"camera_to_world": p.flatten().tolist(), "fov": fov, "aspect": 1.5} for p in opengl]
+    nerfstudio["camera_path"] = path
     transforms = {"w": width, "h": height, "fl_x": focal}
     transforms["frames"] = [{"transform_matrix": pose.tolist()} for pose in opengl]
     forms = {"nerfstudio": nerfstudio, "transforms": transforms}

@@ -96,8 +96,6 @@ def test_export_leaves_them_out_and_says_so(tmp_path, capsys):
             if "ply" in kind:
                 assert b"comment from a chair by tiny.safetensors\n" in (out / name).read_bytes()
     # Formats of 8 bits round other opacities up to 1/255.
-    images = [
-        turntable_frames(read_gaussians(out / "a.ply"), size=48, frames=3) for out in (few, all_)
-    ]
-    assert np.array_equal(*images)
+    drawn = (read_gaussians(out / "a.ply") for out in (few, all_))
+    assert np.array_equal(*(turntable_frames(each, size=48, frames=3) for each in drawn))
     assert load_ply(few / "a.ply").num == 2000

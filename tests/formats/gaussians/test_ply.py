@@ -54,9 +54,8 @@ def test_the_file_is_the_standard_layout_in_another_reader(tmp_path):
     opacity = 1 / (1 + np.exp(-vertex["opacity"]))
     np.testing.assert_allclose(opacity, gaussians.opacities, rtol=1e-5)
     np.testing.assert_allclose(np.exp(vertex["scale_2"]), gaussians.scales[:, 2], rtol=1e-5)
-    np.testing.assert_allclose(
-        vertex["f_dc_1"] * SH_C0 + 0.5, gaussians.colors[:, 1], atol=1e-6, rtol=0
-    )
+    green = vertex["f_dc_1"] * SH_C0 + 0.5
+    np.testing.assert_allclose(green, gaussians.colors[:, 1], atol=1e-6, rtol=0)
     w = gaussians.quats[:, 0] / gaussians.quats.norm(dim=1)
     np.testing.assert_allclose(vertex["rot_0"], w, atol=1e-6)
 
