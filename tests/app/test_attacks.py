@@ -255,8 +255,9 @@ def test_no_such_result_is_one_line(program, index):
 def test_uploads_are_bounded(served, program):
     answer = program.ask("/gradio_api/upload", form(bytes((MEGABYTES << 20) + 1)), **FORM)
     assert answer.status == 413 and b"maximum allowed size" in answer.body
-    kept = [path for path in served.temporary.rglob("*") if path.is_file()]
-    assert all(path.stat().st_size <= MEGABYTES << 20 for path in kept)
+    # Warp keeps headers in a folder of its own while it compiles.
+    files = (p for p in served.temporary.rglob("*") if not p.parent.name.startswith("wp_pch_"))
+    assert not [p for p in files if p.is_file() and p.stat().st_size > MEGABYTES << 20]
 
 
 def test_an_upload_stays_in_the_folder_of_the_page(served, program):
