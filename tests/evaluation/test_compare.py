@@ -69,8 +69,8 @@ def test_means_intervals_and_paired_differences(files):
     words = [
         f"ours={files.add('one', views_report())}",
         f"ours={files.add('two', shapes_report())}",
-        f"theirs={files.add('three', views_report(1.0))}",
     ]
+    words.append(f"theirs={files.add('three', views_report(1.0))}")
     code, said, joined = files.run(*words, "--json")
     assert code == 0 and json.loads(said.out) == joined
     code, said, joined = files.run(*words)
@@ -122,10 +122,8 @@ def test_what_a_method_lacks_counts_for_none_and_is_named(files):
     code, said, joined = files.run(f"x={first}", f"y={files.add('two', lacking)}")
     assert code == 0 and joined["common"]["psnr"] == ["b", "c"]
     assert joined["rows"][0]["psnr"]["mean"] == 21.5
-    assert joined["missing"]["eval-views"] == {
-        "x": {"a": "not in its report"},
-        "y": {"d": "no image of view 3"},
-    }
+    missing = {"x": {"a": "not in its report"}, "y": {"d": "no image of view 3"}}
+    assert joined["missing"]["eval-views"] == missing
     assert "y lacks 1 object (d: no image of view 3)" in said.out
 
 
@@ -187,13 +185,9 @@ def test_what_cannot_stand_in_one_table_is_refused(files, one, other, said):
 def test_what_only_places_a_methods_files_may_differ(files):
     gaussians = change(shapes_report(kind="gaussians", voxels=64), frame="reference")
     views = change(V, lpips="VGG16", split="all", distance=2.0, resize_images=True)
-    code, said, joined = files.run(
-        *(f"{name}={files.add(name + kind, report)}"
-          for name, kind, report in (
-              ("x", "views", V), ("x", "shapes", S), ("y", "views", views),
-              ("y", "shapes", gaussians),
-          ))
-    )  # fmt: skip
+    reports = {"x-views": V, "x-shapes": S, "y-views": views, "y-shapes": gaussians}
+    words = [f"{name[0]}={files.add(name, report)}" for name, report in reports.items()]
+    code, said, _ = files.run(*words)
     assert code == 0 and "Images of y were resized" in said.out
 
 

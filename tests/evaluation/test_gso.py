@@ -8,11 +8,12 @@ from helpers import micro
 from helpers.refusals import refused, refused_command
 from helpers.views import eval_views, evaluated
 
-from gamba_warp.cli import run
 from gamba_warp.data import gso
 from gamba_warp.formats.ply import save_ply
 
 THERE = gso.NAMES[:2]
+PLAIN = ("--protocol", "gso", "--no-baselines", "--sheet", 0, "--strips", 0)
+COARSE = ("--points", 256, "--views", 8, "--pixels", 32, "--voxels", 24)
 
 
 @pytest.fixture(scope="module")
@@ -33,8 +34,7 @@ def data(tmp_path_factory):
 
 def test_views(data, tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(gso, "SIZE", 24)  # 512 pixels take a minute
-    options = ["--protocol", "gso", "--no-baselines", "--sheet", 0, "--strips", 0]
-    code, report = eval_views(data / "pred", data / "views", tmp_path, *options)
+    code, report = eval_views(data / "pred", data / "views", tmp_path, *PLAIN)
     protocol = report["protocol"]
     assert code == 1  # 58 are missing
     assert (protocol["size"], protocol["reference"], protocol["views"]) == (24, 0, None)
@@ -54,18 +54,15 @@ def test_another_list_of_objects(data, tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(gso, "SIZE", 24)
     own = tmp_path / "own.txt"
     own.write_text(f"not of the list\n\n{THERE[1]}\nabsent\n")
-    options = ["--protocol", "gso", "--objects", own, "--no-baselines", "--sheet", 0, "--strips", 0]
-    code, report = eval_views(data / "pred", data / "views", tmp_path / "out", *options)
+    places = data / "pred", data / "views", tmp_path / "out"
+    code, report = eval_views(*places, *PLAIN, "--objects", own)
     said = report["protocol"]["evaluation"]
     assert code == 1 and said["missing"] == ["absent"] and said["objects"] == 3
     assert report["protocol"]["uids"] == [THERE[1], "not of the list"]
     assert said["list"] == "given by --objects" and said["others"] == [THERE[0]]
     words = [data / "pred", data / "meshes", "--protocol", "gso", "--data", data / "views"]
     own.write_text(f"{THERE[0]}\n")
-    more = ["--objects", own, "--out", tmp_path / "shapes", "--points", 256]
-    more += ["--views", 8, "--pixels", 32, "--voxels", 24]
-    code = run("eval-geometry", [*map(str, [*words, *more])])
-    found = json.loads((tmp_path / "shapes" / "report.json").read_text())
+    _, found = evaluated("eval-geometry", tmp_path / "shapes", *words, *COARSE, "--objects", own)
     assert (found["evaluation"]["objects"], found["evaluation"]["evaluated"]) == (1, 1)
     capsys.readouterr()
     refusals = {b"": "contains no names", b"a\na\n": "a occurs twice", b"\xff": "not UTF-8"}
@@ -91,8 +88,7 @@ def test_its_options_are_its_own(data, capsys):
 
 def test_geometry(data, tmp_path):
     words = [data / "pred", data / "meshes", "--protocol", "gso", "--data", data / "views"]
-    words += ["--points", 256, "--views", 8, "--pixels", 32, "--voxels", 24]
-    code, report = evaluated("eval-geometry", tmp_path, *words)
+    code, report = evaluated("eval-geometry", tmp_path, *words, *COARSE)
     protocol = report["protocol"]
     assert code == 1
     assert (protocol["name"], protocol["frame"], protocol["up"]) == ("gso", "reference", "z")
