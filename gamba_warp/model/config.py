@@ -5,11 +5,11 @@ from __future__ import annotations
 import json
 import re
 from dataclasses import asdict, dataclass, fields
-from typing import Annotated, Any, Literal, get_type_hints
+from typing import Annotated, Any, Literal
 
 from ..conventions import DEFAULT_DISTANCE, DEFAULT_FOV
 from ..errors import UserError
-from ..untrusted.ranges import Meta, check_kind, check_values
+from ..untrusted.ranges import Meta, check_kinds, check_values
 
 Norm = Literal["layer", "rms"]
 Discretization = Literal["mamba", "bilinear", "zoh"]
@@ -165,9 +165,8 @@ class GambaConfig:
     background: Background = "white"
 
     def __post_init__(self) -> None:
-        for name, kind in get_type_hints(type(self)).items():
-            check_kind(f"config: {name} is", getattr(self, name), kind)
-        check_values(vars(self), type(self), lambda name: f"config: {name} is")
+        for check in (check_kinds, check_values):
+            check(vars(self), type(self), "config: {} is".format)
         if not re.fullmatch(r"[A-Za-z0-9_.-]{1,100}", self.encoder):
             raise UserError(f"config: encoder is {self.encoder[:100]!r}, not a network's name")
         self._check_relations()

@@ -88,25 +88,27 @@ def check_range(label: str, value: float, limits: Meta) -> None:
         raise UserError(f"{label} {shown}{mark} {reason}")
 
 
-def check_kind(label: str, value: object, kind: Any) -> None:
-    """Check that a value has a plain type, or is one of a ``Literal``'s.
+def check_kinds(values: Mapping[str, Any], owner: Callable, label: Callable[[str], str]) -> None:
+    """Check values against plain types and ``Literal``s.
 
     Args:
-        label: start of the message, such as "config: width is".
-        value: any; an integer is accepted as a float, True and False only as a bool.
-        kind: the type.
+        values: by name; an integer is accepted as a float, True and False only as a bool.
+        owner: the dataclass that declares the types.
+        label: start of the message, from a value's name.
 
     Raises:
         UserError: one line with the value and the expected type.
     """
-    shown = repr(value)[:100]
-    if typing.get_origin(kind) is typing.Literal:
-        if value not in typing.get_args(kind):
-            raise UserError(f"{label} {shown}, not one of {', '.join(typing.get_args(kind))}")
-        return
-    fits = isinstance(value, (int, float) if kind is float else kind)
-    if not fits or (isinstance(value, bool) and kind is not bool):
-        raise UserError(f"{label} {shown}, it must be of type {kind.__name__}")
+    for name, kind in typing.get_type_hints(owner).items():
+        value, choices = values[name], typing.get_args(kind)
+        if typing.get_origin(kind) is typing.Literal:
+            fits, words = value in choices, f"not one of {', '.join(choices)}"
+        else:
+            fits = isinstance(value, (int, float) if kind is float else kind)
+            fits = fits and (kind is bool or not isinstance(value, bool))
+            words = f"it must be of type {kind.__name__}"
+        if not fits:
+            raise UserError(f"{label(name)} {repr(value)[:100]}, {words}")
 
 
 def check_values(values: Mapping[str, Any], owner: Callable, label: Callable[[str], str]) -> None:
@@ -125,7 +127,8 @@ def check_values(values: Mapping[str, Any], owner: Callable, label: Callable[[st
         for item in value if isinstance(value, (list, tuple)) else [value]:
             if isinstance(item, (int, float)) and not isinstance(item, bool):
                 for limits in ranges:
-                    check_range(label(name), item, limits)
+                    if range_error(item, limits):
+                        check_range(label(name), item, limits)
 
 
 @functools.cache
