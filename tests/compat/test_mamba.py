@@ -18,7 +18,7 @@ from gamba_warp.compat.mamba_ssm import InferenceParams, Mamba, selective_scan_f
 MATRICES = [*product([CONSTANT, VARYING], repeat=2), (GROUPED, GROUPED)]
 MATRICES += [(CONSTANT, GROUPED), (GROUPED, CONSTANT)]
 # Half an ulp of the output is 2^-12 of float16 and 2^-9 of bfloat16; the interior is float32.
-SCAN_LIMITS = {torch.float32: 2e-6, torch.float16: 5e-4, torch.bfloat16: 4e-3}
+SCAN_LIMITS = {torch.float32: 1e-6, torch.float16: 5e-4, torch.bfloat16: 4e-3}
 
 
 # Relative to the output's largest value. Float32: rounding of sums in another order. The halves:
@@ -44,7 +44,8 @@ def test_the_grid(matrices, dtype):
         assert got["out"].dtype == dtype and got["last"].dtype == torch.float32
         for name, value in want.items():
             # A cotangent in the output's dtype, and a sum of rounded products, in each gradient.
-            assert_rel_rms(got[name], value, 2 * SCAN_LIMITS[dtype], f"{name} ({given})")
+            limit = SCAN_LIMITS[dtype] * (1 if name in ("out", "last") else 2)
+            assert_rel_rms(got[name], value, limit, f"{name} ({given})")
 
 
 @pytest.mark.parametrize("matrices", MATRICES, ids=str)
