@@ -165,8 +165,8 @@ class GambaConfig:
     background: Background = "white"
 
     def __post_init__(self) -> None:
-        for check in (check_kinds, check_values):
-            check(vars(self), type(self), "config: {} is".format)
+        check_kinds(vars(self), type(self), "config: {} is".format)
+        check_values(vars(self), type(self), "config: {} is".format)
         if not re.fullmatch(r"[A-Za-z0-9_.-]{1,100}", self.encoder):
             raise UserError(f"config: encoder is {self.encoder[:100]!r}, not a network's name")
         self._check_relations()

@@ -127,8 +127,7 @@ def check_values(values: Mapping[str, Any], owner: Callable, label: Callable[[st
         for item in value if isinstance(value, (list, tuple)) else [value]:
             if isinstance(item, (int, float)) and not isinstance(item, bool):
                 for limits in ranges:
-                    if range_error(item, limits):
-                        check_range(label(name), item, limits)
+                    check_range(label(name), item, limits)
 
 
 @functools.cache

@@ -180,12 +180,12 @@ def test_every_kind_of_number_is_read(tmp_path, dtype, order):
     ],
     ids=range(22),
 )
-def test_lies_are_one_line(tmp_path, content, reason):
+def test_an_invalid_array_is_one_line(tmp_path, content, reason):
     path = tmp_path / "a.npy"
     path.write_bytes(content)
     refused_at(path, reason, read_array, path, (3, 2))
 
 
-def test_what_is_no_file(tmp_path):
+def test_an_unreadable_path_is_one_line(tmp_path):
     for path in (tmp_path, tmp_path / "none.npy", tmp_path / ("n" * 300), tmp_path / "a\0b"):
         refused("cannot be read", read_array, path, (3, 2))
